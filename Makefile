@@ -1,0 +1,47 @@
+PYTHON ?= python3
+PYTEST_ARGS ?= -n 2
+
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+REQUIREMENTS := pyproject.toml constraints.txt
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint types check clean
+
+help:
+	@echo "make demo    the story on bundled recordings"
+	@echo "make test    all tests"
+	@echo "make lint    ruff"
+	@echo "make types   pyright"
+	@echo "make check   test, lint and types"
+	@echo "make clean   remove the virtual environment and caches"
+
+demo: .venv/.installed
+	$(BIN)/jaxid demo
+
+test: .venv/.installed-dev
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: .venv/.installed-dev
+	$(BIN)/ruff check .
+
+types: .venv/.installed-dev
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+check: test lint types
+
+clean:
+	rm -rf .venv .pytest_cache .ruff_cache .hypothesis build dist
+	find jaxid tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+.venv/.created:
+	$(PYTHON) -m venv .venv
+	@touch $@
+
+.venv/.installed: .venv/.created $(REQUIREMENTS)
+	$(PIP) --editable .
+	@touch $@
+
+.venv/.installed-dev: .venv/.created $(REQUIREMENTS)
+	$(PIP) --editable '.[dev]'
+	@touch $@ .venv/.installed

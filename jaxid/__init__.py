@@ -1,0 +1,27 @@
+"""Identify robot arms from closed-loop recordings, and find the physical effect the model lacks."""
+
+import jax as _jax
+
+_jax.config.update("jax_enable_x64", True)
+
+from . import arms as arms  # noqa: E402
+from . import control as control  # noqa: E402
+from . import effects as effects  # noqa: E402
+from .estimate import DIDIM as DIDIM  # noqa: E402
+from .estimate import IDIM as IDIM  # noqa: E402
+from .estimate import IDIMIV as IDIMIV  # noqa: E402
+from .estimate import OEM as OEM  # noqa: E402
+from .estimate import Filtering as Filtering  # noqa: E402
+from .estimate import Fit as Fit  # noqa: E402
+from .estimate import Status as Status  # noqa: E402
+from .estimate import fit as fit  # noqa: E402
+from .loop import ClosedLoop as ClosedLoop  # noqa: E402
+from .parameters import parameter as parameter  # noqa: E402
+from .recording import Recording as Recording  # noqa: E402
+from .recording import Recordings as Recordings  # noqa: E402
+from .recording import read as read  # noqa: E402
+from .robots import emps as emps  # noqa: E402
+from .robots import scara as scara  # noqa: E402
+from .robots import two_link as two_link  # noqa: E402
+from .simulate import simulate as simulate  # noqa: E402
+from .stepping import Stepping as Stepping  # noqa: E402

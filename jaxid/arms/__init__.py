@@ -1,0 +1,6 @@
+"""Rigid bodies: equations of motion in base parameters, one arm a file."""
+
+from ._base import AbstractArm as AbstractArm
+from .axis import Axis as Axis
+from .scara import SCARA as SCARA
+from .two_link import TwoLink as TwoLink

@@ -1,0 +1,11 @@
+"""Controllers: they act on what the sensor reads."""
+
+from ._base import AbstractController as AbstractController
+from ._base import Reading as Reading
+from ._base import Reference as Reference
+from ._base import Signals as Signals
+from .cascade import Cascade as Cascade
+from .open_loop import OpenLoop as OpenLoop
+from .pd import PD as PD
+from .pd import Sampled as Sampled
+from .tracking import Tracking as Tracking

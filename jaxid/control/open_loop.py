@@ -1,0 +1,25 @@
+"""The recorded torque as input: no feedback at all."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..recording import Recording
+from ._base import AbstractController, Reading, Reference, Signals
+
+
+class OpenLoop(AbstractController):
+    """The recorded torque drives the arm; what can be compared is the motion."""
+
+    def command(
+        self,
+        reading: Reading,
+        reference: Reference,
+        state: Float[Array, " states"],
+        mass: Float[Array, "joints joints"],
+    ) -> Float[Array, " joints"]:
+        """The recorded torque, `(joints,)`, N·m or N."""
+        return reference.tau + jnp.zeros_like(reading.q)
+
+    def signals(self, recording: Recording) -> Signals:
+        """The recorded motion (not used) and torque, `(samples, joints)`."""
+        return Signals(recording.q, recording.tau)

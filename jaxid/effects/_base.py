@@ -1,0 +1,94 @@
+"""What an effect may do, and where on the signal's way it may do it."""
+
+import re
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ..parameters import Scalar
+
+
+class Motion(eqx.Module):
+    """What an effect sees of the arm at one instant; every vector is `(joints,)`.
+
+    `t` in s; `q`, `v`, `a` in rad or m and their derivatives; `tau` what the drives deliver, N·m
+    or N. `a` is zero where an effect is not `inertial`. `state` is the effect's own.
+    `label` tells recordings apart (`recording_label`).
+    """
+
+    t: Float[Array, ""]
+    q: Float[Array, " joints"]
+    v: Float[Array, " joints"]
+    a: Float[Array, " joints"]
+    tau: Float[Array, " joints"]
+    state: Float[Array, " states"]
+    label: Int[Array, ""]
+
+
+class AbstractEffect(eqx.Module):
+    """One physical phenomenon. Override what it does; zero amplitude must be exactly absent.
+
+    `command` acts on the torque on its way through the drive, `torque` at the joint, `read` on
+    what the sensor reports. What lies between drive and link is an `AbstractTransmission`.
+
+    Class attributes: `inertial` says that `torque` depends on acceleration (it must then be
+    affine in it).
+    """
+
+    inertial: ClassVar[bool] = False
+
+    @classmethod
+    def effect_name(cls) -> str:
+        """Its name in tables: the class's in lower case with underscores."""
+        return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
+
+    def initial_state(self) -> Float[Array, " states"]:
+        """Its own states at rest; none by default."""
+        return jnp.zeros(0)
+
+    def derivative(self, motion: Motion) -> Float[Array, " states"]:
+        """Rate of its own states, per s."""
+        return jnp.zeros_like(motion.state)
+
+    def command(self, motion: Motion) -> Float[Array, " joints"]:
+        """What becomes of the drive's torque `motion.tau`, `(joints,)`."""
+        return motion.tau
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """What it asks of the drives on top of the rigid arm, `(joints,)`; friction opposes."""
+        return jnp.zeros_like(motion.v)
+
+    def read(self, q: Float[Array, " joints"]) -> Float[Array, " joints"]:
+        """What the sensor reports at position q, `(joints,)`."""
+        return q
+
+
+class AbstractTransmission(AbstractEffect):
+    """Something that gives way between drive and link of one joint.
+
+    The drive keeps the inertia `rotor`; the sensor and the friction sit on the drive. The twist
+    (link minus drive) and its rate are the effect's states.
+    """
+
+    joint: eqx.AbstractVar[int]
+    rotor: eqx.AbstractVar[Scalar]
+
+    def initial_state(self) -> Float[Array, " states"]:
+        """No twist, at rest."""
+        return jnp.zeros(2)
+
+    def through(self, twist: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
+        """Torque that the drive passes on to the link at this twist (rad) and rate (rad/s)."""
+        raise NotImplementedError
+
+
+def on_joint(joint: int, value: Float[Array, ""], motion: Motion) -> Float[Array, " joints"]:
+    """A torque on one joint (counted from 1) and none on the others, `(joints,)`."""
+    return jnp.zeros_like(motion.v).at[joint - 1].set(value)
+
+
+def smooth_sign(v: Float[Array, "..."], gamma: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The sign of a velocity made differentiable: 2/pi · arctan(gamma v); gamma in s/rad or s/m."""
+    return 2 / jnp.pi * jnp.arctan(gamma * v)

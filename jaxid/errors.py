@@ -1,0 +1,46 @@
+"""What jaxid raises and warns with: every message is one sentence that says what to do."""
+
+import importlib
+from types import ModuleType
+
+
+class JaxidError(Exception):
+    """Anything jaxid raises on purpose."""
+
+
+class RecordingError(JaxidError, ValueError):
+    """A recording, or the file it comes from, cannot be used as it is."""
+
+
+class ModelError(JaxidError, ValueError):
+    """A model is put together in a way that has no meaning."""
+
+
+class FitError(JaxidError, RuntimeError):
+    """An estimate was asked for that the data or the settings do not allow."""
+
+
+class MissingExtraError(JaxidError, ImportError):
+    """A package is needed that only an optional extra of jaxid installs."""
+
+
+class JaxidWarning(UserWarning):
+    """Something is likely, not surely, a mistake."""
+
+
+def require(module: str, extra: str) -> ModuleType:
+    """Imports a module that only an extra installs.
+
+    **Arguments:**
+
+    - `module`: dotted name of the module, e.g. `"pyarrow.parquet"`.
+    - `extra`: the extra of `jaxid-robotics` that installs it.
+
+    **Raises:** `MissingExtraError` that names the extra.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingExtraError(
+            f"{module} cannot be imported ({error}): pip install 'jaxid-robotics[{extra}]'"
+        ) from error

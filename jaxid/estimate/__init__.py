@@ -1,0 +1,11 @@
+"""Methods, one a file, all through `fit(loop, recordings, method)`."""
+
+from ._base import AbstractMethod as AbstractMethod
+from ._base import Fit as Fit
+from ._base import Status as Status
+from ._fit import fit as fit
+from ._regression import Filtering as Filtering
+from .didim import DIDIM as DIDIM
+from .didim import IDIMIV as IDIMIV
+from .idim import IDIM as IDIM
+from .oem import OEM as OEM

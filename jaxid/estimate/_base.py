@@ -1,0 +1,212 @@
+"""What every method is, and what every fit gives."""
+
+import abc
+import enum
+import html
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
+from jaxtyping import Float
+
+from .. import figures
+from ..loop import ClosedLoop
+from ..recording import Recording, Recordings
+
+
+class Status(enum.Enum):
+    """How a fit ended."""
+
+    converged = "converged"
+    stalled = "stopped without progress before the tolerance was met"
+    max_steps = "reached the largest number of iterations; raise max_steps"
+    diverged = "no parameter values were found at which the loop can be simulated"
+
+
+class Fit(eqx.Module):
+    """What an estimate gave: a loop with its parameters, how sure they are, and how it went.
+
+    - `loop`: the model with the estimated values.
+    - `covariance`: of `loop.theta`, `(parameters, parameters)`; infinite where not determined.
+    - `residuals`: measured less simulated torque (for a position output: position), one
+      `(samples, joints)` for each recording.
+    - `undetermined`: sentences that name the directions the data say nothing about.
+    - `notes`: what else a reader should know.
+    """
+
+    loop: ClosedLoop
+    recordings: Recordings
+    method: Any
+    status: Status = eqx.field(static=True)
+    covariance: Float[np.ndarray, "parameters parameters"]
+    residuals: tuple[Float[np.ndarray, "samples_ joints"], ...]
+    error_percent: pd.DataFrame
+    iterations: int = eqx.field(static=True, default=0)
+    simulations: int = eqx.field(static=True, default=0)
+    seconds: float = eqx.field(static=True, default=0.0)
+    deviations: str = eqx.field(static=True, default="")
+    undetermined: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether it converged."""
+        return self.status is Status.converged
+
+    @property
+    def theta(self) -> Float[np.ndarray, " parameters"]:
+        """Estimated values, in the order of `names`."""
+        return np.asarray(self.loop.theta)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the estimated values."""
+        return self.loop.names
+
+    @property
+    def std(self) -> Float[np.ndarray, " parameters"]:
+        """Standard deviations, in the units of the parameters; infinite where not determined."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """One unit for each value."""
+        return tuple(p.declaration.unit for p in self.loop.free_parameters for _ in p.names)
+
+    def table(self) -> pd.DataFrame:
+        """Value, unit, standard deviation and relative deviation (A.4) of each parameter."""
+        value, std = self.theta, self.std
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = np.where(value != 0, 100 * std / np.abs(value), np.inf)
+        return pd.DataFrame(
+            {"value": value, "std": std, "std_percent": relative, "unit": list(self.units)},
+            index=pd.Index(self.names, name="parameter"),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything a report needs, as plain JSON."""
+        rows = self.table()
+        return {
+            "robot": self.loop.name,
+            "method": repr(self.method),
+            "status": self.status.name,
+            "parameters": {
+                str(name): {
+                    "value": float(row["value"]),
+                    "std": float(row["std"]) if np.isfinite(row["std"]) else None,
+                    "unit": row["unit"],
+                }
+                for name, row in rows.iterrows()
+            },
+            "error_percent": errors_to_dict(self.error_percent),
+            "deviations": self.deviations,
+            "undetermined": list(self.undetermined),
+            "notes": list(self.notes),
+            "iterations": self.iterations,
+            "seconds": self.seconds,
+        }
+
+    def plot(self) -> go.Figure:
+        """The parameters with their deviations."""
+        std = np.where(np.isfinite(self.std), self.std, np.nan)
+        return figures.parameters(list(self.names), self.theta, std, list(self.units))
+
+    def __repr__(self) -> str:
+        lines = [
+            f"{self.method!r} of {self.loop.name} to {', '.join(self.recordings.names)}: "
+            f"{self.status.value} ({self.iterations} iterations, {self.seconds:.2f} s)",
+            self.table().to_string(float_format=lambda x: f"{x:.4g}"),
+            "relative error, %:",
+            self.error_percent.to_string(float_format=lambda x: f"{x:.3f}"),
+        ]
+        if self.deviations:
+            lines.append(f"deviations: {self.deviations}")
+        lines += [*self.undetermined, *self.notes]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        head = html.escape(repr(self).split("\n")[0])
+        foot = "".join(f"<p>{html.escape(s)}</p>" for s in (*self.undetermined, *self.notes))
+        return (
+            f"<p>{head}</p>{self.table().to_html(float_format=lambda x: f'{x:.4g}')}"
+            f"<p>relative error, %</p>{self.error_percent.to_html(float_format='%.3f')}{foot}"
+        )
+
+
+class AbstractMethod(eqx.Module):
+    """An estimator with its settings."""
+
+    @abc.abstractmethod
+    def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
+        """Estimates the loop's free parameters; called by `jaxid.fit`."""
+
+
+def joint_columns(joints: int) -> list[str]:
+    """Column names for joints, counted from 1."""
+    return [f"joint {j}" for j in range(1, joints + 1)]
+
+
+def relative_errors(
+    recordings: Recordings | Sequence[Recording],
+    measured: Sequence[Float[np.ndarray, "samples_ joints"]],
+    residuals: Sequence[Float[np.ndarray, "samples_ joints"]],
+) -> pd.DataFrame:
+    """100 · ‖residual‖ / ‖measured‖ by recording and joint (Table 3 of Brunot et al. 2016)."""
+    rows = [
+        100 * np.linalg.norm(e, axis=0) / np.linalg.norm(m, axis=0)
+        for m, e in zip(measured, residuals, strict=True)
+    ]
+    names = pd.Index([r.name for r in recordings], name="recording")
+    return pd.DataFrame(rows, index=names, columns=joint_columns(measured[0].shape[1]))
+
+
+def errors_to_dict(errors: pd.DataFrame) -> dict[str, list[float | None]]:
+    """Relative errors as JSON: a list of joints for each recording."""
+    return {
+        str(name): [float(x) if np.isfinite(x) else None for x in row]
+        for name, row in zip(errors.index, errors.to_numpy(), strict=True)
+    }
+
+
+def determined_covariance(
+    information: Float[np.ndarray, "parameters parameters"],
+    names: Sequence[str],
+    meat: Float[np.ndarray, "parameters parameters"] | None = None,
+) -> tuple[Float[np.ndarray, "parameters parameters"], tuple[str, ...]]:
+    """The inverse of an information matrix, and what the data say nothing about.
+
+    **Arguments:**
+
+    - `information`: J'J of the weighted residuals.
+    - `names`: of its rows.
+    - `meat`: covariance of the score where it is not `information`; gives the sandwich.
+    """
+    size = np.sqrt(np.maximum(np.diag(information), 0))
+    floor = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(information / np.outer(floor, floor))
+    # Columns have unit length, so that rounding stands at 1e-16 and a direction below 1e-11 is
+    # one along which the signals change by less than their own rounding.
+    weak = values < 1e-11
+    strong = vectors[:, ~weak]
+    inverse = (strong / values[~weak]) @ strong.T / np.outer(floor, floor)
+    covariance = inverse if meat is None else inverse @ meat @ inverse
+    lost = np.zeros(len(names), bool)
+    sentences = []
+    for k in np.flatnonzero(weak):
+        along = vectors[:, k] / floor
+        along = along / np.abs(along).max()
+        part = np.abs(vectors[:, k]) > 1e-3
+        lost |= part
+        terms = " ".join(f"{along[i]:+.3g}·{names[i]}" for i in np.flatnonzero(part))
+        sentences.append(
+            f"these recordings do not determine {', '.join(names[i] for i in np.flatnonzero(part))}"
+            f": the signals do not change along {terms}"
+        )
+    covariance = np.array(covariance)
+    covariance[lost, :] = 0.0
+    covariance[:, lost] = 0.0
+    covariance[lost, lost] = np.inf
+    return covariance, tuple(sentences)

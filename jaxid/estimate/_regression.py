@@ -1,0 +1,172 @@
+"""From signals to a linear regression: filtered motion, columns, decimation."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy import signal
+
+from ..effects import Motion
+from ..errors import FitError
+from ..loop import ClosedLoop, inverse
+from ..parameters import Parameter, read_values, write_values
+from ..recording import Recording
+from ..simulate import Simulated, recording_label
+
+
+class Filtering(eqx.Module):
+    """Band-pass filtering and decimation after Gautier 1997.
+
+    **Arguments:**
+
+    - `cutoff`: of the low-pass on position, applied forward and backward, Hz; by default a tenth
+      of the sample rate.
+    - `rate`: sample rate after decimation, Hz; by default the cutoff.
+    - `order`: of the Butterworth filter.
+    - `trim`: dropped at both ends, s; by default five samples after decimation.
+    """
+
+    cutoff: float | None = eqx.field(static=True, default=None)
+    rate: float | None = eqx.field(static=True, default=None)
+    order: int = eqx.field(static=True, default=4)
+    trim: float | None = eqx.field(static=True, default=None)
+
+    def settled(self, recording: Recording) -> tuple[float, int, int]:
+        """Cutoff in Hz, decimation factor and samples to drop, for a recording.
+
+        **Raises:** `FitError` for a cutoff above the Nyquist rate, or too few samples.
+        """
+        cutoff = self.cutoff or recording.rate / 10
+        if cutoff >= recording.rate / 2:
+            raise FitError(
+                f"a cutoff of {cutoff:g} Hz is above half the sample rate of {recording.name} "
+                f"({recording.rate:g} Hz): lower it"
+            )
+        factor = max(1, round(recording.rate / (self.rate or cutoff)))
+        trim = 5 * factor - 1 if self.trim is None else round(self.trim * recording.rate)
+        if recording.samples - 2 * trim < 4 * factor:
+            raise FitError(
+                f"{recording.name} has {recording.samples} samples, too few for decimation by "
+                f"{factor} and {trim} dropped at each end: raise rate or lower trim"
+            )
+        return cutoff, factor, trim
+
+
+def filtered(recording: Recording, filtering: Filtering) -> Simulated:
+    """Position, velocity and acceleration by zero-phase filtering and central differences.
+
+    Uneven samples are first laid on an even grid.
+    """
+    cutoff, _, _ = filtering.settled(recording)
+    n = recording.samples
+    time = np.linspace(recording.time[0], recording.time[-1], n)
+
+    def even(x: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(time, recording.time, column) for column in x.T], axis=1)
+
+    sections = signal.butter(filtering.order, cutoff, fs=recording.rate, output="sos")
+    q = signal.sosfiltfilt(sections, even(recording.q), axis=0)
+    dt = time[1] - time[0]
+    v = np.gradient(q, dt, axis=0)
+    a = np.gradient(v, dt, axis=0)
+    tau = even(recording.tau)
+    return Simulated(time, q, v, a, tau, tau, np.zeros((n, 0)))  # type: ignore[arg-type]
+
+
+def linear_parameters(loop: ClosedLoop) -> tuple[Parameter, ...]:
+    """The free parameters in which torque is linear."""
+    return tuple(p for p in loop.free_parameters if p.declaration.linear)
+
+
+def effect_states(
+    loop: ClosedLoop, time: Float[Array, " samples"], motion: Motion
+) -> tuple[Float[Array, "samples _"], ...]:
+    """The effects' own states along a given motion, by Heun's method between samples.
+
+    `motion` has `(samples,)` before every axis.
+    """
+
+    def body(states, pair):
+        now, then, h = pair
+        rates, after = [], []
+        for effect, x in zip(loop.effects, states, strict=True):
+            start = effect.derivative(eqx.tree_at(lambda m: m.state, now, x))
+            guess = x + h * start
+            end = effect.derivative(eqx.tree_at(lambda m: m.state, then, guess))
+            rates.append(x)
+            after.append(x + h * (start + end) / 2)
+        return tuple(after), tuple(rates)
+
+    following = jax.tree.map(lambda x: jnp.concatenate([x[1:], x[-1:]]), motion)
+    steps = jnp.diff(time, append=time[-1:])
+    start = tuple(effect.initial_state() for effect in loop.effects)
+    return jax.lax.scan(body, start, (motion, following, steps))[1]
+
+
+def mismatch(loop: ClosedLoop, at: Motion) -> Float[Array, "samples joints"]:
+    """What the motion takes less what the drives deliver, along samples, `(samples, joints)`."""
+    states = effect_states(loop, at.t, at)
+
+    def one(motion: Motion, own: tuple[Float[Array, " _"], ...]) -> Float[Array, " joints"]:
+        delivered = motion
+        for effect, state in zip(loop.effects, own, strict=True):
+            seen = eqx.tree_at(lambda m: m.state, delivered, state)
+            delivered = eqx.tree_at(lambda m: m.tau, delivered, effect.command(seen))
+        return inverse(loop, delivered, own) - delivered.tau
+
+    return jax.vmap(one)(at, states)
+
+
+@eqx.filter_jit
+def _columns(loop: ClosedLoop, at: Motion) -> tuple[Array, Array]:
+    parameters = linear_parameters(loop)
+    theta = read_values(loop, parameters)
+
+    def torque(values: Float[Array, " parameters"]) -> Float[Array, "samples joints"]:
+        return mismatch(write_values(loop, parameters, values), at)
+
+    rest, slope = jax.linearize(torque, theta)
+    columns = jax.vmap(slope, out_axes=-1)(jnp.eye(len(theta)))
+    return columns, jnp.einsum("kjp,p->kj", columns, theta) - rest
+
+
+def regression(
+    loop: ClosedLoop, recording: Recording, motion: Simulated
+) -> tuple[Float[np.ndarray, "samples joints parameters"], Float[np.ndarray, "samples joints"]]:
+    """Columns and right-hand side of the inverse dynamic model, equation (4), along a motion.
+
+    **Arguments:**
+
+    - `loop`: which arm and effects; parameters that are held stay at their values.
+    - `recording`: whose torque is explained.
+    - `motion`: filtered or simulated position, velocity and acceleration; `tau` is explained.
+    """
+    n = motion.q.shape[0]
+    label = jnp.full(n, recording_label(recording.name))
+    at = jax.vmap(Motion)(
+        jnp.asarray(motion.time),
+        jnp.asarray(motion.q),
+        jnp.asarray(motion.v),
+        jnp.asarray(motion.a),
+        jnp.asarray(motion.tau),
+        jnp.zeros((n, 0)),
+        label,
+    )
+    columns, right = _columns(loop, at)
+    return np.asarray(columns), np.asarray(right)
+
+
+def decimator(
+    recording: Recording, filtering: Filtering
+) -> Callable[[Float[np.ndarray, "samples *axes"]], Float[np.ndarray, "kept *axes"]]:
+    """The parallel filter that torque and every column pass alike, and its decimation."""
+    _, factor, trim = filtering.settled(recording)
+
+    def apply(x: np.ndarray) -> np.ndarray:
+        inner = x[trim : x.shape[0] - trim]
+        return inner if factor == 1 else signal.decimate(inner, factor, axis=0)
+
+    return apply

@@ -1,0 +1,129 @@
+"""DIDIM and IDIM-IV: regressions on the motion of the simulated loop."""
+
+import time
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import FitError
+from ..loop import ClosedLoop
+from ..parameters import Bounds, write_values
+from ..recording import Recordings
+from ..simulate import Simulated, simulate
+from ._base import AbstractMethod, Fit, Status
+from ._regression import Filtering, linear_parameters
+from .idim import Solved, Stacked, Weights, regression_fit, solve, stack
+
+
+def physical(loop: ClosedLoop, theta: Float[np.ndarray, " parameters"]) -> ClosedLoop:
+    """The loop at values moved inside their bounds; the loop itself where that is not enough.
+
+    **Arguments:**
+
+    - `theta`: values of the parameters in which torque is linear, `(parameters,)`.
+    """
+    chosen = linear_parameters(loop)
+    bounds = Bounds.of(chosen)
+    moved = write_values(loop, chosen, bounds.inside(bounds.outside(jnp.asarray(theta))))
+    return moved if float(moved.arm.smallest_inertia()) > 0 else loop
+
+
+def _explaining(recordings: Recordings, runs: tuple[Simulated, ...]) -> list[Simulated]:
+    """The simulated motion, with the measured torque to explain."""
+    return [
+        eqx.tree_at(lambda s: s.tau, run, recording.tau)
+        for run, recording in zip(runs, recordings, strict=True)
+    ]
+
+
+class _Iterated(AbstractMethod):
+    filtering: eqx.AbstractVar[Filtering]
+    weights: eqx.AbstractVar[Weights]
+    tolerance: eqx.AbstractVar[float]
+    max_steps: eqx.AbstractVar[int]
+
+    def solve_once(
+        self, loop: ClosedLoop, recordings: Recordings, motions: list[Simulated]
+    ) -> tuple[Stacked, Solved]:
+        """One regression on the simulated motion."""
+        raise NotImplementedError
+
+    def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
+        """Alternates simulation and regression; called by `jaxid.fit`."""
+        started = time.perf_counter()
+        status, stacked, solved, before, k = Status.max_steps, None, None, None, 0
+        for k in range(1, self.max_steps + 1):
+            runs = simulate(loop, recordings)
+            if not all(np.isfinite(run.q).all() and np.isfinite(run.a).all() for run in runs):
+                status = Status.diverged
+                break
+            stacked, solved = self.solve_once(loop, recordings, _explaining(recordings, runs))
+            loop = physical(loop, solved.theta)
+            change = np.inf if before is None else np.abs(solved.theta - before)
+            if np.all(change <= self.tolerance * np.abs(solved.theta)):
+                status = Status.converged
+                break
+            before = solved.theta
+        if stacked is None or solved is None:
+            raise FitError(
+                f"{type(self).__name__} cannot start: the loop diverges in simulation at its "
+                "initial values; start from the result of IDIM"
+            )
+        return regression_fit(loop, recordings, self, stacked, solved, started, status, k)
+
+
+class DIDIM(_Iterated):
+    """Pseudo-linear regression, equation (10): regressors of the simulated closed loop.
+
+    (Gautier, Janot, Vandanjon 2013.)
+
+    **Arguments:**
+
+    - `filtering`: parallel filter and decimation of torque and columns.
+    - `weights`: as for `IDIM`.
+    - `tolerance`: relative change of every parameter at which it stops.
+    - `max_steps`: largest number of simulations.
+    """
+
+    filtering: Filtering = Filtering()
+    weights: Weights = eqx.field(static=True, default="joint")
+    tolerance: float = 1e-3
+    max_steps: int = eqx.field(static=True, default=20)
+
+    def solve_once(
+        self, loop: ClosedLoop, recordings: Recordings, motions: list[Simulated]
+    ) -> tuple[Stacked, Solved]:
+        """Least squares on the simulated motion."""
+        stacked = stack(loop, recordings, self.filtering, motions)
+        names = tuple(name for p in linear_parameters(loop) for name in p.names)
+        return stacked, solve(stacked, names, self.weights)
+
+
+class IDIMIV(_Iterated):
+    """Instrumental variables: regressors of the measured motion, instruments of the simulated.
+
+    (Janot, Vandanjon, Gautier 2014.)
+
+    **Arguments:**
+
+    - `filtering`: of the measured motion; parallel filter and decimation of all.
+    - `weights`: as for `IDIM`.
+    - `tolerance`: relative change of every parameter at which it stops.
+    - `max_steps`: largest number of simulations.
+    """
+
+    filtering: Filtering = Filtering()
+    weights: Weights = eqx.field(static=True, default="joint")
+    tolerance: float = 1e-3
+    max_steps: int = eqx.field(static=True, default=20)
+
+    def solve_once(
+        self, loop: ClosedLoop, recordings: Recordings, motions: list[Simulated]
+    ) -> tuple[Stacked, Solved]:
+        """Instrumental variables with the simulated motion's columns."""
+        measured = stack(loop, recordings, self.filtering)
+        instruments = stack(loop, recordings, self.filtering, motions)
+        names = tuple(name for p in linear_parameters(loop) for name in p.names)
+        return measured, solve(measured, names, self.weights, instruments.columns)

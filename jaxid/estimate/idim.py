@@ -1,0 +1,172 @@
+"""IDIM-LS: least squares on the inverse dynamic model."""
+
+import time
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import FitError
+from ..loop import ClosedLoop
+from ..parameters import write_values
+from ..recording import Recordings
+from ._base import AbstractMethod, Fit, Status, determined_covariance, relative_errors
+from ._regression import Filtering, decimator, filtered, linear_parameters, regression
+
+Weights = Literal["ordinary", "joint", "robust"]
+
+
+class Stacked(eqx.Module):
+    """The regression of all recordings, decimated: columns, right-hand side, who owns a row."""
+
+    columns: Float[np.ndarray, "samples joints parameters"]
+    right: Float[np.ndarray, "samples joints"]
+    lengths: tuple[int, ...] = eqx.field(static=True)
+
+    def split(self, rows: Float[np.ndarray, "samples joints"]) -> list[np.ndarray]:
+        """Rows by recording."""
+        return np.split(rows, np.cumsum(self.lengths)[:-1])
+
+
+def stack(loop: ClosedLoop, recordings: Recordings, filtering: Filtering, motions=None) -> Stacked:
+    """Columns and right-hand side of equation (4) over all recordings.
+
+    **Arguments:**
+
+    - `loop`: the model.
+    - `filtering`: of the motion and, in parallel, of torque and columns.
+    - `motions`: simulated signals in place of the filtered ones, one for each recording.
+
+    **Raises:** `FitError` where the filtering does not suit a recording.
+    """
+    columns, rights = [], []
+    for k, recording in enumerate(recordings):
+        motion = filtered(recording, filtering) if motions is None else motions[k]
+        wide, right = regression(loop, recording, motion)
+        reduce = decimator(recording, filtering)
+        columns.append(reduce(wide))
+        rights.append(reduce(right))
+    return Stacked(np.concatenate(columns), np.concatenate(rights), tuple(len(r) for r in rights))
+
+
+class Solved(eqx.Module):
+    """A solved regression."""
+
+    theta: Float[np.ndarray, " parameters"]
+    covariance: Float[np.ndarray, "parameters parameters"]
+    residual: Float[np.ndarray, "samples joints"]
+    undetermined: tuple[str, ...] = eqx.field(static=True)
+
+
+def solve(
+    stacked: Stacked,
+    names: tuple[str, ...],
+    weights: Weights,
+    instruments: Float[np.ndarray, "samples joints parameters"] | None = None,
+) -> Solved:
+    """Least squares, or instrumental variables where instruments are given.
+
+    Weighted: each joint's rows by its own deviation, found from an ordinary solution first.
+    Robust: each row besides by Huber's weight.
+    """
+    joints, p = stacked.right.shape[1], stacked.columns.shape[2]
+    if stacked.right.size <= p:
+        raise FitError(
+            f"{stacked.right.size} equations cannot determine {p} parameters: give longer "
+            "recordings, or decimate less"
+        )
+    weight = np.ones_like(stacked.right)
+    left = stacked.columns if instruments is None else instruments
+    for _ in range({"ordinary": 1, "joint": 3, "robust": 20}[weights]):
+        wide = (weight[..., None] * stacked.columns).reshape(-1, p)
+        right = (weight * stacked.right).reshape(-1)
+        tools = (weight[..., None] * left).reshape(-1, p)
+        scale = np.linalg.norm(wide, axis=0)
+        scale[scale == 0] = 1.0
+        gram = (tools / scale).T @ (wide / scale)
+        theta = np.linalg.lstsq(gram, (tools / scale).T @ right, rcond=1e-12)[0] / scale
+        residual = stacked.right - stacked.columns @ theta
+        sigma = np.sqrt(np.mean((weight * residual) ** 2))
+        if weights != "ordinary":
+            spread = np.sqrt(np.mean(residual**2, axis=0))
+            if weights == "robust":
+                spread = 1.4826 * np.median(np.abs(residual), axis=0)
+            spread = np.where(spread > 0, spread, 1.0)
+            weight = np.broadcast_to(1 / spread, residual.shape).copy()
+        if weights == "robust":
+            large = np.abs(residual) / spread
+            weight *= np.sqrt(np.minimum(1.0, 1.345 / np.maximum(large, 1e-12)))
+    count = stacked.right.shape[0] - p / joints
+    variance = sigma**2 * stacked.right.shape[0] / count
+    information = wide.T @ wide / variance
+    if instruments is None:
+        covariance, lost = determined_covariance(information, names)
+    else:
+        cross = np.linalg.pinv(tools.T @ wide)
+        _, lost = determined_covariance(information, names)
+        covariance = variance * cross @ (tools.T @ tools) @ cross.T
+    return Solved(theta, covariance, residual, lost)
+
+
+def regression_fit(
+    loop: ClosedLoop,
+    recordings: Recordings,
+    method: AbstractMethod,
+    stacked: Stacked,
+    solved: Solved,
+    started: float,
+    status: Status = Status.converged,
+    iterations: int = 1,
+) -> Fit:
+    """The `Fit` of a solved regression."""
+    chosen = linear_parameters(loop)
+    fitted = write_values(loop, chosen, jnp.asarray(solved.theta))
+    shaped = [p.name for p in loop.free_parameters if not p.declaration.linear]
+    fitted = fitted.hold(*shaped) if shaped else fitted
+    notes = []
+    if shaped:
+        notes.append(f"{', '.join(shaped)} stayed as given: torque is not linear in them")
+    if float(fitted.arm.smallest_inertia()) <= 0:
+        notes.append("these values are not physical: the mass matrix is not positive definite")
+    measured = stacked.split(stacked.right)
+    residuals = stacked.split(solved.residual)
+    return Fit(
+        fitted,
+        recordings,
+        method,
+        status,
+        solved.covariance,
+        tuple(residuals),
+        relative_errors(recordings, measured, residuals),
+        iterations,
+        0,
+        time.perf_counter() - started,
+        "least squares, equation (5)",
+        solved.undetermined,
+        tuple(notes),
+    )
+
+
+class IDIM(AbstractMethod):
+    """Least squares on the inverse dynamic model, equations (4) and (5) of Brunot et al. 2016.
+
+    Errors are relative to the filtered and decimated torque.
+
+    **Arguments:**
+
+    - `filtering`: of the motion, in Hz.
+    - `weights`: `"ordinary"`, `"joint"` (each joint by its own deviation) or `"robust"` (Huber).
+    """
+
+    filtering: Filtering = Filtering()
+    weights: Weights = eqx.field(static=True, default="joint")
+
+    def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
+        """Estimates the parameters in which torque is linear; called by `jaxid.fit`."""
+        started = time.perf_counter()
+        stacked = stack(loop, recordings, self.filtering)
+        names = tuple(name for p in linear_parameters(loop) for name in p.names)
+        solved = solve(stacked, names, self.weights)
+        return regression_fit(loop, recordings, self, stacked, solved, started)

@@ -1,0 +1,347 @@
+"""The output-error method: simulate the closed loop, compare, follow the exact gradient."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from ..control import OpenLoop
+from ..errors import FitError, JaxidError
+from ..loop import ClosedLoop
+from ..noise.ar import fit_ar
+from ..parameters import Bounds
+from ..progress import working
+from ..recording import Recording, Recordings
+from ..simulate import (
+    Batch,
+    at_rest,
+    prepare,
+    set_substeps,
+    simulate,
+    with_substeps,
+)
+from ._base import AbstractMethod, Fit, Status, determined_covariance, relative_errors
+from ._least_squares import Minimum, Problem, Sensitivity, minimise
+from .didim import DIDIM, physical
+from .idim import IDIM
+
+Output = Literal["torque", "position", "both"]
+Deviations = Literal["sandwich", "white"]
+
+
+class OEM(AbstractMethod):
+    """Output error, equations (7) and (9) of Brunot et al. 2016, by Levenberg–Marquardt.
+
+    All recordings at once, each output weighted by its own deviation, iterates kept physical.
+
+    **Arguments:**
+
+    - `output`: what is compared: `"torque"`, `"position"` or `"both"`; by default torque, but
+      position where the recorded torque drives the arm.
+    - `start`: `"auto"` takes the best of the loop's own values, IDIM's and DIDIM's; `"given"`
+      starts from the loop's values.
+    - `initial`: `"rest"` trusts the first sample, `"free"` estimates every initial state,
+      `"auto"` estimates those of recordings that do not start at rest.
+    - `window`: length in s of pieces simulated on their own, each from its own estimated state
+      (multiple shooting); None for whole recordings.
+    - `deviations`: `"sandwich"` for coloured residuals, `"white"` for (A.1) as in the paper.
+    - `solver`: optimistix's, with tolerances relative to scaled parameters and weighted errors.
+    - `max_steps`: largest number of iterations.
+    - `progress`: whether to show it on a terminal.
+    """
+
+    output: Output | None = eqx.field(static=True, default=None)
+    start: Literal["auto", "given"] = eqx.field(static=True, default="auto")
+    initial: Literal["auto", "rest", "free"] = eqx.field(static=True, default="auto")
+    window: float | None = eqx.field(static=True, default=None)
+    deviations: Deviations = eqx.field(static=True, default="sandwich")
+    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
+    max_steps: int = eqx.field(static=True, default=100)
+    progress: bool = eqx.field(static=True, default=True)
+
+    def __repr__(self) -> str:
+        changed = [
+            f"{field.name}={value!r}"
+            for field in dataclasses.fields(self)
+            if field.name not in ("solver", "progress")
+            and (value := getattr(self, field.name)) != field.default
+        ]
+        return f"OEM({', '.join(changed)})"
+
+    def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
+        """Estimates the loop's free parameters; called by `jaxid.fit`."""
+        started = time.perf_counter()
+        if not loop.names:
+            raise FitError(
+                f"{loop.name} has no free parameter to estimate: free one with loop.free(name)"
+            )
+        with working(f"OEM of {loop.name}", self.progress) as say:
+            loop = start_values(loop, recordings, self.start, say)
+            loop = with_substeps(loop, recordings)
+            done = _converge(self, loop, recordings, say)
+            finer = _too_coarse(done, recordings)
+            if finer is not None:
+                say(f"again with {finer} steps between samples")
+                done = _converge(self, set_substeps(done.loop, finer), recordings, say)
+        return _report(self, done, recordings, time.perf_counter() - started)
+
+
+def start_values(
+    loop: ClosedLoop, recordings: Recordings, start: str, say: Callable[[str], None]
+) -> ClosedLoop:
+    """The loop at the best start: its own values, IDIM's or DIDIM's, by simulated torque error.
+
+    Parameters in which torque is not linear keep their values.
+    """
+    if start == "given":
+        return loop
+    say("start values by inverse dynamics")
+    candidates = [loop]
+    for method in (IDIM(), DIDIM(max_steps=4)):
+        try:
+            found = method.fit(candidates[-1], recordings)
+        except JaxidError:
+            continue
+        if np.isfinite(found.theta).all():
+            candidates.append(physical(loop, _linear_values(found)))
+    if isinstance(loop.controller, OpenLoop):
+        return candidates[-1]
+    errors = [_simulated_error(candidate, recordings) for candidate in candidates]
+    return candidates[int(np.argmin(errors))]
+
+
+def _linear_values(fit: Fit) -> Float[np.ndarray, " parameters"]:
+    return np.asarray(fit.theta)
+
+
+def _simulated_error(loop: ClosedLoop, recordings: Recordings) -> float:
+    """Sum over joints of the relative torque error of a simulation; infinite if it fails."""
+    runs = simulate(loop, recordings)
+    error = np.zeros(loop.joints)
+    size = np.zeros(loop.joints)
+    for run, recording in zip(runs, recordings, strict=True):
+        error += np.sum((recording.tau - run.tau) ** 2, axis=0)
+        size += np.sum(recording.tau**2, axis=0)
+    total = float(np.sum(error / size))
+    return total if np.isfinite(total) else np.inf
+
+
+class _Done(eqx.Module):
+    """A converged (or not) minimisation, with what is needed to report it."""
+
+    loop: ClosedLoop
+    pieces: tuple[Recording, ...]
+    batch: Batch
+    weights: Float[Array, " outputs"]
+    minimum: Minimum
+    signals: tuple[str, ...] = eqx.field(static=True)
+    iterations: int = eqx.field(static=True)
+
+
+def pieces_of(recordings: Recordings, window: float | None) -> tuple[Recording, ...]:
+    """The recordings cut into windows that share their end samples; whole where None."""
+    if window is None:
+        return tuple(recordings)
+    pieces = []
+    for r in recordings:
+        step = max(2, round(window * r.rate))
+        for first in range(0, r.samples - 2, step):
+            last = min(first + step, r.samples - 1)
+            if last - first >= min(step, 8):
+                end = r.time[last + 1] if last + 1 < r.samples else None
+                pieces.append(r.slice(float(r.time[first]), end if end is None else float(end)))
+    if not pieces:
+        raise FitError(f"a window of {window:g} s is shorter than a few samples: make it longer")
+    return tuple(pieces)
+
+
+def _signals(method: OEM, loop: ClosedLoop) -> tuple[str, ...]:
+    output = method.output or ("position" if isinstance(loop.controller, OpenLoop) else "torque")
+    if output != "position" and isinstance(loop.controller, OpenLoop):
+        raise FitError(
+            "the recorded torque drives this loop, so there is no torque to compare: use "
+            "OEM(output='position')"
+        )
+    return {"torque": ("tau",), "position": ("q",), "both": ("tau", "q")}[output]
+
+
+def _free_starts(method: OEM, pieces: Sequence[Recording]) -> Float[np.ndarray, " recordings"]:
+    if method.initial == "rest":
+        return np.zeros(len(pieces))
+    if method.initial == "free" or method.window is not None:
+        return np.ones(len(pieces))
+    return np.array([0.0 if at_rest(piece) else 1.0 for piece in pieces])
+
+
+def _first_weights(
+    loop: ClosedLoop, pieces: Sequence[Recording], signals: tuple[str, ...]
+) -> Float[np.ndarray, " outputs"]:
+    """One over a tenth of each output's size: the first guess, before residuals are known."""
+    sizes = []
+    for signal in signals:
+        values = np.concatenate([getattr(piece, signal) for piece in pieces])
+        sizes.append(np.std(values, axis=0))
+    size = np.concatenate(sizes)
+    return 10 / np.where(size > 0, size, 1.0)
+
+
+def _converge(
+    method: OEM, loop: ClosedLoop, recordings: Recordings, say: Callable[[str], None]
+) -> _Done:
+    """Minimises, then again with the weights and initial states that follow, until they settle."""
+    pieces = pieces_of(recordings, method.window)
+    signals = _signals(method, loop)
+    batch = prepare(loop, pieces)
+    free = _free_starts(method, pieces)
+    weights = jnp.asarray(_first_weights(loop, pieces, signals))
+    bounds = Bounds.of(loop.free_parameters)
+    total, minimum = 0, None
+    for _ in range(10):
+        free_start = bool(free.any())
+        problem = Problem(loop, batch, weights, jnp.asarray(free), bounds, signals, free_start)
+        minimum = minimise(
+            problem, bounds.outside(loop.theta), method.solver, method.max_steps, say
+        )
+        total += minimum.iterations
+        if minimum.status is Status.diverged:
+            break
+        loop = loop.with_theta(bounds.inside(minimum.z))
+        moved = _update_starts(batch, minimum) if free_start else batch
+        new = _new_weights(minimum.found, batch, weights)
+        settled = bool(jnp.all(jnp.abs(new / weights - 1) < 0.02))
+        settled = settled and _same_starts(batch, moved)
+        if settled:
+            break
+        batch, weights = moved, new
+    assert minimum is not None
+    return _Done(loop, pieces, batch, weights, minimum, signals, total)
+
+
+def _update_starts(batch: Batch, minimum: Minimum) -> Batch:
+    n = batch.q0.shape[1]
+    q0, v0 = batch.q0 + minimum.start_step[:, :n], batch.v0 + minimum.start_step[:, n:]
+    return dataclasses.replace(batch, q0=q0, v0=v0)
+
+
+def _same_starts(one: Batch, other: Batch) -> bool:
+    span = jnp.ptp(one.q, axis=(0, 1))
+    moved = jnp.abs(one.q0 - other.q0) / span
+    return bool(jnp.all(moved < 1e-5))
+
+
+def _new_weights(
+    found: Sensitivity, batch: Batch, weights: Float[Array, " outputs"]
+) -> Float[Array, " outputs"]:
+    """One over each output's residual deviation; recorded noise-free outputs keep a floor."""
+    count = jnp.sum(batch.mask)
+    spread = jnp.sqrt(jnp.sum(found.residual**2, axis=(0, 1)) / count) / weights
+    floor = 1e-9 / weights
+    return 1 / jnp.maximum(spread, floor)
+
+
+def _too_coarse(done: _Done, recordings: Recordings) -> int | None:
+    """A finer number of substeps, if halving the step moves the torque by more than 1e-4."""
+    if done.minimum.status is Status.diverged or done.loop.stepping.control is not None:
+        return None
+    if isinstance(done.loop.controller, OpenLoop):
+        return None
+    now = done.loop.stepping.substeps or 1
+    shortest = min(recordings, key=lambda r: r.samples)
+    one = Recordings.of(shortest)
+    coarse = simulate(done.loop, one)[0].tau
+    fine = simulate(set_substeps(done.loop, 2 * now), one)[0].tau
+    size = np.linalg.norm(fine, axis=0)
+    error = np.linalg.norm(coarse - fine, axis=0) / np.where(size > 0, size, 1.0)
+    if not np.isfinite(error).all() or error.max() <= 1e-4:
+        return None
+    return min(64, int(np.ceil(now * (error.max() / 1e-4) ** 0.3)) + 1)
+
+
+def _report(method: OEM, done: _Done, recordings: Recordings, seconds: float) -> Fit:
+    found, mask = done.minimum.found, np.asarray(done.batch.mask)
+    names = done.loop.names
+    residuals = [np.asarray(found.residual)[k][mask[k]] for k in range(len(done.pieces))]
+    jacobians = [np.asarray(found.jacobian)[k][mask[k]] for k in range(len(done.pieces))]
+    if done.minimum.status is Status.diverged:
+        p = len(names)
+        covariance, lost = np.full((p, p), np.inf), ()
+    else:
+        information = sum(np.einsum("kop,koq->pq", j, j) for j in jacobians)
+        meat = score_covariance(residuals, jacobians) if method.deviations == "sandwich" else None
+        covariance, lost = determined_covariance(np.asarray(information), names, meat)
+    unweighted = [r / np.asarray(done.weights) for r in residuals]
+    n = done.loop.joints
+    measured = [getattr(piece, done.signals[0]) for piece in done.pieces]
+    errors = [r[:, :n] for r in unweighted]
+    measured, errors = _rejoin(recordings, done.pieces, measured, errors)
+    notes = _at_bounds(done.loop)
+    how = {"sandwich": "sandwich estimate for coloured residuals", "white": "equation (A.1)"}
+    return Fit(
+        done.loop,
+        recordings,
+        method,
+        done.minimum.status,
+        covariance,
+        tuple(errors),
+        relative_errors(recordings, measured, errors),
+        done.iterations,
+        0,
+        seconds,
+        how[method.deviations],
+        lost,
+        tuple(notes),
+    )
+
+
+def _rejoin(recordings, pieces, measured, errors):
+    """Windows put together again, one entry for each recording."""
+    if len(pieces) == len(recordings):
+        return measured, errors
+    owner = [piece.name for piece in pieces]
+    together = []
+    for values in (measured, errors):
+        together.append(
+            [
+                np.concatenate([x for x, name in zip(values, owner, strict=True) if name == r.name])
+                for r in recordings
+            ]
+        )
+    return together
+
+
+def _at_bounds(loop: ClosedLoop) -> list[str]:
+    notes = []
+    for p in loop.free_parameters:
+        value = np.ravel(np.asarray(p.where(loop)))
+        for bound, word in ((p.declaration.lower, "lower"), (p.declaration.upper, "upper")):
+            if np.isfinite(bound) and np.any(np.abs(value - bound) < 2e-3 * p.declaration.scale):
+                notes.append(f"{p.name} is at its {word} bound, {bound:g} {p.declaration.unit}")
+    return notes
+
+
+def score_covariance(
+    residuals: Sequence[Float[np.ndarray, "samples_ outputs"]],
+    jacobians: Sequence[Float[np.ndarray, "samples_ outputs parameters"]],
+) -> Float[np.ndarray, "parameters parameters"]:
+    """Covariance of J'r where residuals are coloured: their spectrum, weighed by J's.
+
+    Each output's residuals are taken as one autoregressive process over all recordings, with the
+    order by AIC; outputs as uncorrelated.
+    """
+    outputs, p = jacobians[0].shape[1:]
+    meat = np.zeros((p, p))
+    for o in range(outputs):
+        series = [r[:, o] - r[:, o].mean() for r in residuals]
+        noise = fit_ar(series)
+        for j in jacobians:
+            size = 1 << int(np.ceil(np.log2(2 * j.shape[0])))
+            wave = np.fft.fft(j[:, o], size, axis=0)
+            power = noise.spectrum(size)[:, None]
+            meat += np.real(wave.conj().T @ (power * wave)) / size
+    return meat

@@ -1,0 +1,355 @@
+"""The closed loop: arm, effects, controller and sensors, and its equations of motion."""
+
+import dataclasses
+import math
+from collections.abc import Iterable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .arms import AbstractArm
+from .control import AbstractController, Reading, Reference
+from .effects import AbstractEffect, AbstractTransmission, Motion
+from .errors import ModelError
+from .parameters import (
+    Parameter,
+    Vector,
+    list_parameters,
+    read_values,
+    set_by_name,
+    write_values,
+)
+from .stepping import Stepping
+
+
+class State(eqx.Module):
+    """The loop's state: drive positions and velocities, the effects' states, the controller's."""
+
+    q: Float[Array, " joints"]
+    v: Float[Array, " joints"]
+    effects: tuple[Float[Array, " _"], ...]
+    controller: Float[Array, " states"]
+
+
+class ClosedLoop(eqx.Module):
+    """An arm with its effects under feedback control.
+
+    **Arguments:**
+
+    - `arm`: rigid bodies.
+    - `controller`: acts on what the sensors read.
+    - `effects`: friction and whatever else; the order is that of the signal through the drive.
+    - `name`: how results call the robot.
+    - `held`: names of parameters that fits leave at their values.
+    - `freed`: names of parameters that fits estimate although they are not free by declaration.
+    - `resolution`: step of the simulated encoders, `(joints,)`, rad or m; None for ideal ones.
+    - `stepping`: how it is integrated.
+    """
+
+    arm: AbstractArm
+    controller: AbstractController
+    effects: tuple[AbstractEffect, ...] = eqx.field(default=(), converter=tuple)
+    name: str = eqx.field(static=True, default="robot")
+    held: frozenset[str] = eqx.field(static=True, default=frozenset(), converter=frozenset)
+    freed: frozenset[str] = eqx.field(static=True, default=frozenset(), converter=frozenset)
+    resolution: tuple[float, ...] | None = eqx.field(static=True, default=None)
+    stepping: Stepping = Stepping()
+
+    def __check_init__(self):
+        for effect in self.effects:
+            joint = getattr(effect, "joint", None)
+            if joint is not None and not 1 <= joint <= self.joints:
+                raise ModelError(
+                    f"{effect.effect_name()} is on joint {joint}, but {self.name} has joints 1 to "
+                    f"{self.joints}: joints count from 1"
+                )
+
+    @property
+    def joints(self) -> int:
+        """How many joints the arm has."""
+        return self.arm.joints
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Every parameter of the arm, the effects and the controller."""
+        return list_parameters(self)
+
+    @property
+    def free_parameters(self) -> tuple[Parameter, ...]:
+        """The parameters that a fit estimates, in the order of its vectors."""
+        return tuple(
+            p
+            for p in self.parameters
+            if (p.declaration.free or p.name in self.freed) and p.name not in self.held
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One name for each value that a fit estimates."""
+        return tuple(name for p in self.free_parameters for name in p.names)
+
+    @property
+    def theta(self) -> Vector:
+        """The values that a fit estimates, `(parameters,)`."""
+        return read_values(self, self.free_parameters)
+
+    def with_theta(self, theta: Vector) -> "ClosedLoop":
+        """The same loop with other values for its free parameters, `(parameters,)`."""
+        return write_values(self, self.free_parameters, theta)
+
+    def with_values(self, **values: float) -> "ClosedLoop":
+        """The same loop with parameters set by name.
+
+        **Raises:** `ModelError` for a name it does not have.
+        """
+        return set_by_name(self, **values)
+
+    def hold(self, *names: str, **values: float) -> "ClosedLoop":
+        """The same loop with parameters that fits leave alone, at given values if there are any.
+
+        **Raises:** `ModelError` for a name it does not have.
+        """
+        chosen = {*names, *values}
+        self._check_names(chosen)
+        loop = self.with_values(**values) if values else self
+        return dataclasses.replace(loop, held=loop.held | chosen, freed=loop.freed - chosen)
+
+    def free(self, *names: str) -> "ClosedLoop":
+        """The same loop with parameters that fits estimate.
+
+        **Raises:** `ModelError` for a name it does not have.
+        """
+        self._check_names(names)
+        return dataclasses.replace(
+            self, held=self.held - frozenset(names), freed=self.freed | frozenset(names)
+        )
+
+    def _check_names(self, names: Iterable[str]) -> None:
+        known = [p.name for p in self.parameters]
+        for name in names:
+            if name not in known:
+                raise ModelError(
+                    f"there is no parameter {name!r} in this model: it has {', '.join(known)}"
+                )
+
+    def add(self, *effects: AbstractEffect) -> "ClosedLoop":
+        """The same loop with more effects."""
+        return dataclasses.replace(self, effects=(*self.effects, *effects))
+
+    def without(self, name: str, joint: int | None = None) -> "ClosedLoop":
+        """The same loop without the effects of a name, on one joint or on all.
+
+        **Arguments:**
+
+        - `name`: as in tables, for instance `"coulomb"`.
+        - `joint`: counted from 1; None for all.
+
+        **Raises:** `ModelError` if there is no such effect.
+        """
+
+        def named(effect: AbstractEffect) -> bool:
+            where = getattr(effect, "joint", None)
+            return effect.effect_name() == name and (joint is None or where == joint)
+
+        kept = tuple(effect for effect in self.effects if not named(effect))
+        if len(kept) == len(self.effects):
+            there = sorted({effect.effect_name() for effect in self.effects})
+            where = "" if joint is None else f" on joint {joint}"
+            raise ModelError(
+                f"there is no effect {name!r}{where} to take away: the loop has {', '.join(there)}"
+            )
+        return dataclasses.replace(self, effects=kept)
+
+    def __repr__(self) -> str:
+        effects = ", ".join(
+            effect.effect_name() + (f"({effect.joint})" if hasattr(effect, "joint") else "")  # type: ignore[attr-defined]
+            for effect in self.effects
+        )
+        values = ", ".join(
+            f"{p.name} {float(p.where(self)):.4g}" for p in self.free_parameters if not p.several
+        )
+        return (
+            f"ClosedLoop({self.name}: {type(self.arm).__name__} with {effects}; "
+            f"{type(self.controller).__name__}; {values})"
+        )
+
+
+def rest(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> State:
+    """The state at a position and velocity, `(joints,)`, with all else at rest."""
+    effects = tuple(effect.initial_state() for effect in loop.effects)
+    return State(q, v, effects, loop.controller.initial_state(read(loop, q, v)))
+
+
+def read(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Reading:
+    """What the sensors report at a position and velocity, `(joints,)`."""
+
+    def sensor(position: Float[Array, " joints"]) -> Float[Array, " joints"]:
+        for effect in loop.effects:
+            position = effect.read(position)
+        return position
+
+    seen, rate = jax.jvp(sensor, (q,), (v,))
+    if loop.resolution is not None:
+        step = jnp.asarray(loop.resolution)
+        # Rounding has no slope; sensitivities go through as if the encoder were ideal.
+        seen = seen + jax.lax.stop_gradient(step * jnp.round(seen / step) - seen)
+    return Reading(seen, rate)
+
+
+def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solves a small positive-definite system, unrolled: LAPACK's call costs more than the sums."""
+    n = right.shape[0]
+    rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
+    b = [right[i] for i in range(n)]
+    for k in range(n):
+        for i in range(k + 1, n):
+            factor = rows[i][k] / rows[k][k]
+            rows[i] = [rows[i][j] - factor * rows[k][j] for j in range(n)]
+            b[i] = b[i] - factor * b[k]
+    x: list[Float[Array, ""]] = [b[0]] * n
+    for i in reversed(range(n)):
+        rest_of_row = sum((rows[i][j] * x[j] for j in range(i + 1, n)), jnp.zeros(()))
+        x[i] = (b[i] - rest_of_row) / rows[i][i]
+    return jnp.stack(x)
+
+
+class Instant(eqx.Module):
+    """Everything about one instant of the loop; vectors are `(joints,)`.
+
+    `command` is what the controller asks for and what gets recorded, `tau` what the drives
+    deliver, `a` the acceleration of the drives.
+    """
+
+    reading: Reading
+    command: Float[Array, " joints"]
+    tau: Float[Array, " joints"]
+    a: Float[Array, " joints"]
+    derivative: State
+
+
+def effect_load(
+    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...]
+) -> Float[Array, " joints"]:
+    """Torque that all effects together ask for at a motion, `(joints,)`."""
+    total = jnp.zeros_like(motion.v)
+    for effect, state in zip(loop.effects, states, strict=True):
+        total = total + effect.torque(dataclasses.replace(motion, state=state))
+    return total
+
+
+def inverse(
+    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...]
+) -> Float[Array, " joints"]:
+    """Torque at the joints that a motion takes (the inverse dynamic model), `(joints,)`."""
+    rigid = loop.arm.mass_matrix(motion.q) @ motion.a + loop.arm.bias(motion.q, motion.v)
+    return rigid + effect_load(loop, motion, states)
+
+
+def _added_inertia(
+    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...]
+) -> Float[Array, "joints joints"]:
+    n = loop.joints
+    inertial = [(e, s) for e, s in zip(loop.effects, states, strict=True) if e.inertial]
+    if not inertial:
+        return jnp.zeros((n, n))
+
+    def torque(a: Float[Array, " joints"]) -> Float[Array, " joints"]:
+        at = dataclasses.replace(motion, a=a)
+        pieces = [e.torque(dataclasses.replace(at, state=s)) for e, s in inertial]
+        return sum(pieces[1:], pieces[0])
+
+    return jax.jacfwd(torque)(motion.a)
+
+
+def instant(
+    loop: ClosedLoop,
+    t: Float[Array, ""],
+    state: State,
+    reference: Reference,
+    push: Float[Array, " joints"],
+    noise: Reading,
+    label: Int[Array, ""],
+) -> Instant:
+    """The closed loop at one instant: what is read, commanded and delivered, and what follows.
+
+    **Arguments:**
+
+    - `t`: time, s.
+    - `state`: of the loop.
+    - `reference`: what the controller is asked for.
+    - `push`: torque on the joints from outside, `(joints,)`, N·m or N.
+    - `noise`: added to what the sensors read.
+    - `label`: which recording.
+    """
+    seen = read(loop, state.q, state.v)
+    seen = Reading(seen.q + noise.q, seen.v + noise.v)
+    mass = loop.arm.mass_matrix(state.q)
+    command = loop.controller.command(seen, reference, state.controller, mass)
+    tau = loop.controller.acting(command, state.controller)
+    motion = Motion(t, state.q, state.v, jnp.zeros_like(state.q), tau, jnp.zeros(0), label)
+    # An effect's own states see what arrives at it, so that lags in a row compose.
+    arriving = []
+    for effect, own in zip(loop.effects, state.effects, strict=True):
+        arriving.append(motion.tau)
+        seen_by = dataclasses.replace(motion, state=own)
+        motion = dataclasses.replace(motion, tau=effect.command(seen_by))
+    a, twisting = _accelerations(loop, motion, state, push)
+    rates = []
+    for k, (effect, own) in enumerate(zip(loop.effects, state.effects, strict=True)):
+        if k in twisting:
+            rates.append(jnp.stack([own[1], twisting[k]]))
+        else:
+            at = dataclasses.replace(motion, a=a, tau=arriving[k], state=own)
+            rates.append(effect.derivative(at))
+    law = loop.controller.derivative(seen, reference, state.controller)
+    return Instant(seen, command, motion.tau, a, State(state.v, a, tuple(rates), law))
+
+
+def _accelerations(
+    loop: ClosedLoop, motion: Motion, state: State, push: Float[Array, " joints"]
+) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
+    """Accelerations of the drives, and of the twist of each transmission by its place."""
+    transmissions = [
+        (k, e) for k, e in enumerate(loop.effects) if isinstance(e, AbstractTransmission)
+    ]
+    friction = effect_load(loop, motion, state.effects)
+    added = _added_inertia(loop, motion, state.effects)
+    available = motion.tau - friction + push
+    if not transmissions:
+        matrix = loop.arm.mass_matrix(state.q) + added
+        return solve_positive(matrix, available - loop.arm.bias(state.q, state.v)), {}
+    return _through_transmissions(loop, state, transmissions, available, added)
+
+
+def _through_transmissions(
+    loop: ClosedLoop,
+    state: State,
+    transmissions: list[tuple[int, AbstractTransmission]],
+    available: Float[Array, " joints"],
+    added: Float[Array, "joints joints"],
+) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
+    """Rotors on the drive's side, the rest of the inertia on the link's (Spong 1987)."""
+    q, v, on_link, rotors = state.q, state.v, available, jnp.zeros_like(state.q)
+    for k, transmission in transmissions:
+        j, (twist, rate) = transmission.joint - 1, state.effects[k]
+        q, v = q.at[j].add(twist), v.at[j].add(rate)
+        on_link = on_link.at[j].set(transmission.through(twist, rate))
+        rotors = rotors.at[j].set(transmission.rotor)
+    matrix = loop.arm.mass_matrix(q) + added - jnp.diag(rotors)
+    link = solve_positive(matrix, on_link - loop.arm.bias(q, v))
+    a, twisting = link, {}
+    for k, transmission in transmissions:
+        j = transmission.joint - 1
+        drive = (available[j] - on_link[j]) / transmission.rotor
+        a = a.at[j].set(drive)
+        twisting[k] = link[j] - drive
+    return a, twisting
+
+
+def sizes(loop: ClosedLoop) -> list[int]:
+    """Lengths of the parts of a state: q, v, each effect's, the controller's."""
+    zeros = jnp.zeros(loop.joints)
+    parts = jax.eval_shape(lambda: rest(loop, zeros, zeros))
+    return [math.prod(leaf.shape) for leaf in jax.tree.leaves(parts)]

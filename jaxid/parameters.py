@@ -1,0 +1,243 @@
+"""What a parameter is: a field declared once with symbol, unit, bounds and scale."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .errors import ModelError
+
+Scalar = Float[Array, ""]
+"""A parameter's value: a float64 array without axes."""
+
+Vector = Float[Array, " parameters"]
+
+
+def _as_float64(value: Any) -> Any:
+    # Equinox runs converters while tree operations hold placeholders in the fields.
+    if isinstance(value, (int, float, complex, list, tuple)) or hasattr(value, "__array__"):
+        return jnp.asarray(value, dtype=jnp.float64)
+    return value
+
+
+class Declaration(eqx.Module):
+    """What a field says about the parameter it holds."""
+
+    symbol: str
+    unit: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    scale: float = 1.0
+    free: bool = True
+    linear: bool = True
+
+
+def parameter(
+    default: Any = dataclasses.MISSING,
+    *,
+    symbol: str,
+    unit: str,
+    lower: float = -math.inf,
+    upper: float = math.inf,
+    scale: float = 1.0,
+    free: bool = True,
+    linear: bool = True,
+) -> Any:
+    """Declares a physical parameter as a field of an arm, an effect or a controller.
+
+    **Arguments:**
+
+    - `default`: value where none is given; in the unit below.
+    - `symbol`: its name in the literature, without the joint (`"Fv"`).
+    - `unit`: SI unit as shown in tables.
+    - `lower`, `upper`: bounds that estimates keep to.
+    - `scale`: typical size.
+    - `free`: whether a fit estimates it unless told otherwise.
+    - `linear`: whether torque is linear in it; regressions leave the others at their values.
+    """
+    declaration = Declaration(symbol, unit, float(lower), float(upper), float(scale), free, linear)
+    extra = {} if default is dataclasses.MISSING else {"default": default}
+    return eqx.field(converter=_as_float64, metadata={"parameter": declaration}, **extra)
+
+
+class Parameter(eqx.Module):
+    """One parameter of a model: its declaration, its unique name and where it lives.
+
+    A field that holds several values (the coefficients of a curve) is one parameter with `size`
+    above one.
+    """
+
+    name: str = eqx.field(static=True)
+    declaration: Declaration = eqx.field(static=True)
+    where: Callable[[Any], Any] = eqx.field(static=True)
+    size: int = eqx.field(static=True, default=1)
+    several: bool = eqx.field(static=True, default=False)
+
+    @property
+    def names(self) -> list[str]:
+        """One name for each value."""
+        if not self.several:
+            return [self.name]
+        return [f"{self.name}[{k}]" for k in range(1, self.size + 1)]
+
+
+class _Path(eqx.Module):
+    """Walks attributes and tuple indices; hashable, so that it can be static."""
+
+    steps: tuple[str | int, ...] = eqx.field(static=True)
+
+    def __call__(self, tree: Any) -> Any:
+        for step in self.steps:
+            tree = tree[step] if isinstance(step, int) else getattr(tree, step)
+        return tree
+
+
+def _declared(module: Any, steps: tuple[str | int, ...]) -> Iterator[tuple[Any, str, _Path]]:
+    if isinstance(module, (tuple, list)):
+        for k, item in enumerate(module):
+            yield from _declared(item, (*steps, k))
+    elif dataclasses.is_dataclass(module):
+        for field in dataclasses.fields(module):
+            if "parameter" in field.metadata:
+                yield module, field.name, _Path((*steps, field.name))
+            elif not field.metadata.get("static", False):
+                yield from _declared(getattr(module, field.name), (*steps, field.name))
+
+
+def list_parameters(model: Any) -> tuple[Parameter, ...]:
+    """All parameters declared anywhere in a module, in the order of its fields.
+
+    The name is the symbol followed by the owner's joint, if it has one; when two would be the
+    same, the later gets `_2`, `_3` and so on.
+    """
+    found: list[Parameter] = []
+    taken: dict[str, int] = {}
+    for owner, field, where in _declared(model, ()):
+        value = getattr(owner, field)
+        if value is None:
+            continue
+        declaration = type(owner).__dataclass_fields__[field].metadata["parameter"]
+        joint = getattr(owner, "joint", None)
+        name = declaration.symbol + ("" if joint is None else str(joint))
+        taken[name] = taken.get(name, 0) + 1
+        if taken[name] > 1:
+            name = f"{name}_{taken[name]}"
+        size = math.prod(value.shape) if hasattr(value, "shape") else 1
+        several = bool(getattr(value, "shape", ()))
+        found.append(Parameter(name, declaration, where, size, several))
+    return tuple(found)
+
+
+def read_values(model: Any, parameters: Sequence[Parameter]) -> Vector:
+    """The values of some parameters of a model as one vector.
+
+    **Arguments:**
+
+    - `model`: what `list_parameters` was called on.
+    - `parameters`: which, and in which order.
+    """
+    if not parameters:
+        return jnp.zeros(0)
+    return jnp.concatenate([jnp.ravel(p.where(model)) for p in parameters])
+
+
+def write_values(model: Any, parameters: Sequence[Parameter], values: Vector) -> Any:
+    """The model with other values for some of its parameters.
+
+    **Arguments:**
+
+    - `model`: what `list_parameters` was called on.
+    - `parameters`: which, and in which order.
+    - `values`: `(parameters,)`, in their units.
+    """
+    if not parameters:
+        return model
+    pieces, start = [], 0
+    for p in parameters:
+        piece = values[start : start + p.size]
+        pieces.append(piece if p.several else piece[0])
+        start += p.size
+    return eqx.tree_at(lambda tree: [p.where(tree) for p in parameters], model, pieces)
+
+
+def set_by_name(model: Any, **values: float) -> Any:
+    """The model with the named parameters set.
+
+    **Raises:** `ModelError` for a name the model does not have.
+    """
+    known = {p.name: p for p in list_parameters(model)}
+    for name in values:
+        if name not in known:
+            raise ModelError(
+                f"there is no parameter {name!r} in this model: it has {', '.join(known)}"
+            )
+    chosen = [known[name] for name in values]
+    flat = jnp.concatenate([jnp.ravel(_as_float64(v)) for v in values.values()])
+    return write_values(model, chosen, flat)
+
+
+class Bounds(eqx.Module):
+    """Maps unbounded coordinates to parameter values inside their bounds.
+
+    Next to the identity away from a bound, so that Gauss-Newton steps stay Gauss-Newton steps.
+    """
+
+    lower: Vector
+    upper: Vector
+    scale: Vector
+
+    @classmethod
+    def of(cls, parameters: Sequence[Parameter]) -> "Bounds":
+        """The bounds that the parameters declare."""
+
+        def gather(pick: Callable[[Declaration], float]) -> Vector:
+            values = [pick(p.declaration) for p in parameters for _ in range(p.size)]
+            return jnp.asarray(values, dtype=jnp.float64)
+
+        return cls(gather(lambda d: d.lower), gather(lambda d: d.upper), gather(lambda d: d.scale))
+
+    def inside(self, z: Vector) -> Vector:
+        """Parameter values from unbounded coordinates."""
+        low, high = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
+        base = jnp.where(low, self.lower, 0.0)
+        top = jnp.where(high, self.upper, 0.0)
+        one_sided = base + self.scale * _squareplus(z)
+        from_above = top - self.scale * _squareplus(-z)
+        both = base + (top - base) * jax.nn.sigmoid(z)
+        free = self.scale * z
+        return jnp.where(
+            low & high, both, jnp.where(low, one_sided, jnp.where(high, from_above, free))
+        )
+
+    def outside(self, values: Vector) -> Vector:
+        """Unbounded coordinates of parameter values; values on a bound are moved just inside."""
+        low, high = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
+        base = jnp.where(low, self.lower, 0.0)
+        top = jnp.where(high, self.upper, 0.0)
+        one_sided = _inverse_squareplus((values - base) / self.scale)
+        from_above = -_inverse_squareplus((top - values) / self.scale)
+        width = jnp.where(low & high, top - base, 1.0)
+        share = jnp.clip((values - base) / width, 1e-6, 1 - 1e-6)
+        both = jnp.log(share) - jnp.log1p(-share)
+        free = values / self.scale
+        return jnp.where(
+            low & high, both, jnp.where(low, one_sided, jnp.where(high, from_above, free))
+        )
+
+
+# Rounding of the corner at a bound, in units of the parameter's scale.
+_CORNER = 1e-3
+
+
+def _squareplus(z: Vector) -> Vector:
+    return 0.5 * (z + jnp.sqrt(z**2 + 4 * _CORNER**2))
+
+
+def _inverse_squareplus(y: Vector) -> Vector:
+    y = jnp.maximum(y, _CORNER)
+    return y - _CORNER**2 / y

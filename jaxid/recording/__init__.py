@@ -1,0 +1,5 @@
+"""Measured data and its checks: from a file, a DataFrame or arrays to SI float64."""
+
+from ._read import read as read
+from ._recording import Recording as Recording
+from ._recording import Recordings as Recordings

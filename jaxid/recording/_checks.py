@@ -1,0 +1,245 @@
+"""What a recording must satisfy before anything is computed from it."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float64
+
+from ..errors import JaxidWarning
+from ._problem import brief, problem
+from ._units import SIGNALS, Units, factors
+
+Gaps = Literal["refuse", "allow"]
+Labels = Mapping[str, Sequence[str]]
+
+_FEWEST_SAMPLES = 20
+
+
+def numeric(source: str, column: str, values: object) -> Float64[np.ndarray, "..."]:
+    """Numbers as float64, of whatever shape they came in.
+
+    **Arguments:**
+
+    - `source`: the file or recording they come from.
+    - `column`: their name there.
+    - `values`: array-like; a missing value becomes NaN.
+
+    **Raises:** `RecordingError` for text, objects, booleans, dates, complex or ragged values.
+    """
+    try:
+        if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "iuf":
+            values = np.ma.filled(values.astype(np.float64), np.nan)
+        if isinstance(values, pd.Series) and values.dtype.kind in "iuf":
+            values = values.to_numpy(np.float64, na_value=np.nan)
+        array = np.asarray(values)
+        if array.dtype.kind in "iuf":
+            with np.errstate(over="ignore"):
+                return array.astype(np.float64)
+    except Exception as error:  # array-likes run code of others, which may raise anything
+        raise problem(
+            source,
+            f"{column} is ragged or no array of numbers",
+            "give one number for each sample and joint",
+        ) from error
+    raise _not_numeric(source, column, array)
+
+
+def _not_numeric(source: str, column: str, array: np.ndarray) -> Exception:
+    remedies = {
+        "b": ("booleans", "give it as numbers"),
+        "c": ("complex values", "give its real part"),
+        "m": ("time differences", "give plain numbers, time in seconds"),
+        "M": ("dates", "give plain numbers, time in seconds from the start"),
+    }
+    if array.dtype.kind in remedies:
+        kind, remedy = remedies[array.dtype.kind]
+        return problem(source, f"{column} holds {kind}", remedy)
+    for index, cell in np.ndenumerate(array):
+        if not is_number(cell):
+            row = index[0] + 1 if index else 1
+            return problem(
+                source,
+                f"{column}, row {row} holds {brief(cell)}, which is not a number",
+                "correct or remove that row, and write numbers with a decimal point",
+            )
+    return problem(
+        source, f"{column} holds text or Python objects", "convert it to floats beforehand"
+    )
+
+
+def is_number(cell: object) -> bool:
+    """Whether a cell reads as one real number."""
+    try:
+        float(cell)  # pyright: ignore[reportArgumentType]
+    except Exception:  # a cell may be any object
+        return False
+    return True
+
+
+def validate(
+    source: str,
+    signals: Mapping[str, Float64[np.ndarray, "..."]],
+    labels: Labels,
+    units: Units | None,
+    gaps: Gaps,
+) -> dict[str, Float64[np.ndarray, "..."]]:
+    """Signals in SI that are safe to compute with.
+
+    **Arguments:**
+
+    - `source`: the file or recording they come from.
+    - `signals`: values by signal, in the units of the file; 1-d means one joint.
+    - `labels`: what the file calls the columns of each signal.
+    - `units`: unit by signal.
+    - `gaps`: `"allow"` to accept missing stretches of time.
+
+    **Returns:** `time` `(samples,)` and the others `(samples, joints)`.
+
+    **Raises:** `RecordingError` for the first thing that is wrong.
+    """
+    scale = factors(source, units)
+    shaped = _shapes(source, signals, labels)
+    if len(shaped["time"]) < _FEWEST_SAMPLES:
+        raise problem(
+            source,
+            f"there are {len(shaped['time'])} samples",
+            f"record at least {_FEWEST_SAMPLES}",
+        )
+    checked = {}
+    for signal, values in shaped.items():
+        joints = values.shape[1] if values.ndim == 2 else 1
+        if len(scale[signal]) not in (1, joints):
+            raise problem(
+                source,
+                f"units gives {len(scale[signal])} units for {signal} of {joints} joints",
+                "give one unit, or one for each joint",
+            )
+        with np.errstate(over="ignore"):
+            checked[signal] = values * scale[signal]
+        _finite(source, signal, checked[signal], labels)
+    _increasing(source, checked["time"], labels, gaps)
+    for signal in ("q", "tau"):
+        _moving(source, signal, checked[signal], labels)
+    _plausible(source, checked, units or {})
+    return checked
+
+
+def _label(labels: Labels, signal: str, joint: int, joints: int) -> str:
+    names = labels.get(signal, ())
+    if len(names) == joints:
+        return names[joint]
+    return f"{names[0] if names else signal}_{joint + 1}"
+
+
+def _shapes(
+    source: str, signals: Mapping[str, Float64[np.ndarray, "..."]], labels: Labels
+) -> dict[str, Float64[np.ndarray, "..."]]:
+    time = signals["time"]
+    if time.ndim == 2 and time.shape[1] == 1:
+        time = time[:, 0]
+    if time.ndim != 1:
+        raise problem(source, f"time has shape {time.shape}", "give one column of times")
+    shaped = {"time": time}
+    for signal in (signal for signal in SIGNALS if signal in signals and signal != "time"):
+        values = signals[signal][:, None] if signals[signal].ndim == 1 else signals[signal]
+        name = brief(", ".join(labels.get(signal, (signal,))))
+        if values.ndim != 2 or values.shape[1] == 0:
+            raise problem(
+                source,
+                f"{signal} ({name}) has shape {signals[signal].shape}",
+                "give it as (samples, joints)",
+            )
+        if len(values) != len(time):
+            raise problem(
+                source,
+                f"{signal} ({name}) has {len(values)} rows where time has {len(time)}",
+                f"give {signal} as (samples, joints), transposed if need be",
+            )
+        shaped[signal] = values
+    joints = shaped["q"].shape[1]
+    for signal, values in shaped.items():
+        if signal != "time" and values.shape[1] != joints:
+            raise problem(
+                source,
+                f"q has {joints} joints and {signal} has {values.shape[1]}",
+                f"give one column of {signal} for each joint",
+            )
+    return shaped
+
+
+def _finite(source: str, signal: str, values: Float64[np.ndarray, "..."], labels: Labels) -> None:
+    if np.isfinite(values).all():
+        return
+    table = values.reshape(len(values), -1)
+    row, joint = np.argwhere(~np.isfinite(table))[0].tolist()
+    raise problem(
+        source,
+        f"{_label(labels, signal, joint, table.shape[1])}, row {row + 1} is empty or not finite "
+        f"({table[row, joint]})",
+        "remove that row or cut the recording there",
+    )
+
+
+def _increasing(
+    source: str, time: Float64[np.ndarray, " samples"], labels: Labels, gaps: Gaps
+) -> None:
+    label = _label(labels, "time", 0, 1)
+    with np.errstate(over="ignore"):
+        steps, span = np.diff(time), time[-1] - time[0]
+    if not (steps > 0).all():
+        row = int(np.argmin(steps > 0))
+        verb = "repeats" if steps[row] == 0 else "goes back"
+        raise problem(
+            source,
+            f"{label} {verb} at row {row + 2} ({time[row + 1]:.9g} s after {time[row]:.9g} s)",
+            "sort the rows by time and drop the repeated ones",
+        )
+    if not np.isfinite(span):
+        raise problem(source, f"{label} spans more than float64 can hold", "give it in seconds")
+    # Uneven sampling has many long steps and a gap is a rare one: five times the median would
+    # take the first for the second, five times the 95th percentile is the same where time is even.
+    too_long = steps / 5 > np.quantile(steps, 0.95, method="lower")
+    if gaps != "allow" and too_long.any():
+        row = int(np.argmax(too_long))
+        raise problem(
+            source,
+            f"{label} has a gap of {steps[row]:.4g} s before row {row + 2}, where the usual step "
+            f"is {np.median(steps):.4g} s",
+            'split the recording there or pass gaps="allow"',
+        )
+
+
+def _moving(
+    source: str, signal: str, values: Float64[np.ndarray, "samples joints"], labels: Labels
+) -> None:
+    for joint, column in enumerate(values.T):
+        if (column == column[0]).all():
+            raise problem(
+                source,
+                f"{signal} of joint {joint + 1} ({_label(labels, signal, joint, len(values.T))}) "
+                f"is constant at {column[0]:.6g}",
+                "check the column's name, or leave that joint out of q and tau",
+            )
+
+
+def _plausible(
+    source: str, signals: Mapping[str, Float64[np.ndarray, "..."]], units: Units
+) -> None:
+    if "q" not in units and np.abs(signals["q"]).max() > 30:
+        joint = int(np.abs(signals["q"]).max(axis=0).argmax())
+        warnings.warn(
+            f"{source}: q of joint {joint + 1} reaches {np.abs(signals['q']).max():.4g} rad, which "
+            'looks like degrees; pass units={"q": "deg"}, or units={"q": "rad"} if it is right.',
+            JaxidWarning,
+            stacklevel=5,
+        )
+    if "time" not in units and np.median(np.diff(signals["time"])) >= 1:
+        warnings.warn(
+            f"{source}: samples are {np.median(np.diff(signals['time'])):.4g} s apart, which looks "
+            'like milliseconds; pass units={"time": "ms"}, or units={"time": "s"} if it is right.',
+            JaxidWarning,
+            stacklevel=5,
+        )

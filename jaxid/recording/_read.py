@@ -1,0 +1,226 @@
+"""From files to recordings."""
+
+import csv
+import gzip
+import io
+import itertools
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import scipy.io
+
+from ..errors import JaxidError, require
+from ._checks import Gaps, is_number
+from ._columns import Columns, Table, from_frame, pick, unique
+from ._problem import brief, problem
+from ._recording import Recording, Recordings, build
+from ._units import Units
+
+
+def read(
+    *paths: str | os.PathLike[str],
+    columns: Columns | None = None,
+    units: Units | None = None,
+    resolution: float | int | Sequence[float] | None = None,
+    gaps: Gaps = "refuse",
+) -> Recordings:
+    """Reads recordings from `.csv`, `.tsv`, `.txt` (or these `.gz`), `.parquet`, `.mat`, `.npz`.
+
+    **Arguments:**
+
+    - `paths`: one file for each recording, which takes the file's name.
+    - `columns`: our names to the file's, e.g. `{"time": "t", "q": ["pos1", "pos2"]}`; a name may
+      be a product, `"gain*current"`. Where silent: `time`, `q_1..n`, `tau_1..n` and, if there,
+      `q_ref_1..n`, `v_1..n`, `tau_ff_1..n`; also `q`, `tau`, ... for all joints at once. Files of
+      the EMPS benchmark are recognised. Other columns are ignored.
+    - `units`: unit by signal, e.g. `{"q": "deg", "v": "deg/s", "tau": "N·mm", "time": "ms"}`; SI
+      where silent, `q_ref` as `q`, `tau_ff` as `tau`.
+    - `resolution`: encoder step, one or one for each joint, rad or m.
+    - `gaps`: `"allow"` to accept missing stretches of time.
+
+    **Raises:** `RecordingError` for whatever makes a file unusable; `MissingExtraError` for a
+    format whose extra is not installed.
+    """
+    if not paths:
+        raise problem("read()", "no file was given", "pass at least one path")
+    return Recordings.of(_read_one(Path(path), columns, units, resolution, gaps) for path in paths)
+
+
+def _read_one(
+    path: Path,
+    columns: Columns | None,
+    units: Units | None,
+    resolution: float | int | Sequence[float] | None,
+    gaps: Gaps,
+) -> Recording:
+    source = str(path)
+    zipped = path.suffix.lower() == ".gz"
+    inner = path.with_suffix("") if zipped else path
+    data = _bytes(source, path)
+    reader = _reader(source, inner.suffix.lower(), zipped)
+    try:
+        table = reader(source, gzip.decompress(data) if zipped else data)
+    except JaxidError:
+        raise
+    except Exception as error:  # parsers of broken files raise nearly anything
+        raise problem(
+            source,
+            f"cannot be read as {inner.suffix}{path.suffix * zipped}, it is damaged, cut off or of "
+            f"another kind ({type(error).__name__}: {error})",
+            "write or copy the file again",
+        ) from error
+    picked = pick(source, table, columns)
+    return build(source, inner.stem, picked, units, resolution, gaps)
+
+
+def _reader(source: str, extension: str, zipped: bool) -> Callable[[str, bytes], Table]:
+    match extension:
+        case ".csv" | ".tsv" | ".txt":
+            return _text
+        case ".parquet" if not zipped:
+            return _parquet
+        case ".mat" if not zipped:
+            return _mat
+        case ".npz" if not zipped:
+            return _npz
+    raise problem(
+        source,
+        f"the extension {brief(Path(source).suffix)} is not known",
+        "use .csv, .tsv or .txt (or these with .gz), .parquet, .mat or .npz",
+    )
+
+
+def _bytes(source: str, path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise problem(source, "there is no such file", "check the path") from error
+    except IsADirectoryError as error:
+        raise problem(source, "is a directory", "name the files in it") from error
+    except (OSError, ValueError, MemoryError) as error:
+        raise problem(
+            source, f"cannot be opened ({error})", "check the path and permissions"
+        ) from error
+    if not data:
+        raise problem(source, "the file is empty", "record or copy it again")
+    return data
+
+
+def _text(source: str, data: bytes) -> Table:
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise _binary(source) from error
+    if "\0" in text:
+        raise _binary(source)
+    lines = [line for line in io.StringIO(text, newline=None) if line.strip()]
+    names, delimiter, rows = _header(source, lines)
+    unique(source, names)
+    for row, line in enumerate(rows, start=1):
+        if (cells := len(_cells(line, delimiter))) != len(names):
+            raise problem(
+                source,
+                f"row {row} has {cells} cells where the header has {len(names)}",
+                "complete or remove that row",
+            )
+    if not rows:
+        raise problem(source, "there is a header and no rows", "record or copy it again")
+    frame = pd.read_csv(
+        io.StringIO("".join(rows)),
+        sep=delimiter or r"\s+",
+        header=None,
+        index_col=False,
+        low_memory=False,
+    )
+    if len(frame) != len(rows):
+        raise problem(source, "a quoted cell runs over several rows", "remove its quotes")
+    return from_frame(source, frame.set_axis(names, axis="columns"))
+
+
+def _binary(source: str) -> Exception:
+    return problem(source, "is not UTF-8 text", "export it as plain text, or rename a binary file")
+
+
+def _header(source: str, lines: list[str]) -> tuple[list[str], str, list[str]]:
+    """Column names, delimiter (empty for blanks) and the lines below."""
+    comments = list(itertools.takewhile(_is_comment, lines))
+    rows = list(itertools.filterfalse(_is_comment, lines))
+    first = rows[0] if rows else ""
+    delimiter = max(",;\t|", key=first.count)
+    delimiter = delimiter if delimiter in first else ""
+    if not first:
+        raise problem(source, "there are no rows", "record or copy it again")
+    if not all(is_number(cell) for cell in _cells(first, delimiter)):
+        header, rows = first, rows[1:]
+    # numpy.savetxt writes the header as a comment.
+    elif comments:
+        header = comments[-1].lstrip(" \t#")
+    else:
+        raise problem(
+            source,
+            "there is no header, the first line holds numbers only",
+            "put a first line of names there, such as time,q_1,tau_1",
+        )
+    return [name.strip() for name in _cells(header, delimiter)], delimiter, rows
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith("#")
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    if not delimiter:
+        return line.split()
+    if '"' not in line:
+        return line.rstrip("\r\n").split(delimiter)
+    return next(csv.reader([line], delimiter=delimiter))
+
+
+def _parquet(source: str, data: bytes) -> Table:
+    parquet = require("pyarrow.parquet", "parquet")
+    file = parquet.ParquetFile(io.BytesIO(data), page_checksum_verification=True)
+    # The metadata of pandas could make a column an index and so hide it.
+    return from_frame(source, file.read().to_pandas(ignore_metadata=True))
+
+
+def _mat(source: str, data: bytes) -> Table:
+    if data.startswith(b"MATLAB 7.3") or b"\x89HDF\r\n\x1a\n" in data[:1024]:
+        raise problem(
+            source,
+            "is a MATLAB file of version 7.3 (HDF5)",
+            "save it again in MATLAB with save(file, '-v7')",
+        )
+    listed = scipy.io.whosmat(io.BytesIO(data))
+    unique(source, [name for name, _, _ in listed])
+    odd = ("cell", "struct", "object", "function", "opaque", "sparse", "unknown")
+    refused = {name: f"{kind} variable" for name, _, kind in listed if kind in odd}
+    names = [name for name, _, _ in listed if name not in refused]
+    # An empty list of names would mean all of them.
+    loaded = scipy.io.loadmat(io.BytesIO(data), variable_names=names) if names else {}
+    # MATLAB has no 1-d arrays: a vector comes as one row or one column.
+    return Table(
+        {name: x.ravel() if 1 in x.shape else x for name in names for x in [loaded[name]]}, refused
+    )
+
+
+def _npz(source: str, data: bytes) -> Table:
+    archive = np.load(io.BytesIO(data), allow_pickle=False)
+    if not isinstance(archive, np.lib.npyio.NpzFile):
+        raise problem(
+            source, "holds one bare array", "save named arrays with np.savez(file, time=..., q=...)"
+        )
+    unique(source, archive.files)
+    columns = {}
+    for name in archive.files:
+        try:
+            columns[name] = archive[name]
+        except ValueError as error:
+            raise problem(
+                source,
+                f"array {brief(name)} cannot be read ({error})",
+                "save plain arrays of numbers with np.savez, no Python objects",
+            ) from error
+    return Table(columns)

@@ -1,0 +1,310 @@
+"""Recordings as arrays in SI."""
+
+import html
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from typing import overload
+
+import equinox as eqx
+import numpy as np
+import pandas as pd
+from jaxtyping import Float64
+
+from ._checks import Gaps, numeric, validate
+from ._columns import Columns, Picked, from_frame, pick, quantum
+from ._problem import brief, near, problem
+from ._units import SIGNALS, Units
+
+
+class Recording(eqx.Module):
+    """Sampled signals of one experiment, in NumPy arrays of float64 and SI units.
+
+    Made by `jaxid.read`, `Recording.from_arrays` or `Recording.from_dataframe`, which check it.
+
+    **Fields:**
+
+    - `time`: `(samples,)`, s.
+    - `q`: measured position, `(samples, joints)`, rad or m.
+    - `tau`: the drive's commanded torque as recorded, `(samples, joints)`, N·m or N.
+    - `q_ref`: reference, `(samples, joints)`, rad or m, or None.
+    - `v`: measured velocity, `(samples, joints)`, rad/s or m/s, or None.
+    - `tau_ff`: known torque added to the controller's output, which `tau` contains,
+      `(samples, joints)`, N·m or N, or None.
+    - `resolution`: encoder step, `(joints,)`, rad or m, or None.
+    - `name`: how tables and figures call it.
+    """
+
+    time: Float64[np.ndarray, " samples"]
+    q: Float64[np.ndarray, "samples joints"]
+    tau: Float64[np.ndarray, "samples joints"]
+    q_ref: Float64[np.ndarray, "samples joints"] | None = None
+    v: Float64[np.ndarray, "samples joints"] | None = None
+    tau_ff: Float64[np.ndarray, "samples joints"] | None = None
+    resolution: Float64[np.ndarray, " joints"] | None = None
+    name: str = eqx.field(static=True, default="recording")
+
+    @classmethod
+    def from_arrays(
+        cls,
+        time: object,
+        q: object,
+        tau: object,
+        *,
+        q_ref: object = None,
+        v: object = None,
+        tau_ff: object = None,
+        resolution: float | int | Sequence[float] | np.ndarray | None = None,
+        name: str = "recording",
+        units: Units | None = None,
+        gaps: Gaps = "refuse",
+    ) -> "Recording":
+        """A recording from array-likes, checked.
+
+        **Arguments:**
+
+        - `time`: `(samples,)`, s.
+        - `q`, `tau`, `q_ref`, `v`, `tau_ff`: `(samples, joints)`, or `(samples,)` for one joint;
+          rad or m, N·m or N.
+        - `resolution`: encoder step, one or one for each joint, rad or m.
+        - `name`: how tables and figures call it.
+        - `units`: unit by signal where it is not SI, as in `jaxid.read`.
+        - `gaps`: `"allow"` to accept missing stretches of time.
+
+        **Raises:** `RecordingError` for whatever makes them unusable.
+        """
+        given = {"time": time, "q": q, "tau": tau, "q_ref": q_ref, "v": v, "tau_ff": tau_ff}
+        signals = {
+            signal: numeric(name, signal, values)
+            for signal, values in given.items()
+            if values is not None or signal in ("time", "q", "tau")
+        }
+        labels = {"time": ["time"]}
+        return build(name, name, Picked(signals, labels), units, resolution, gaps)
+
+    @classmethod
+    def from_dataframe(
+        cls,
+        frame: pd.DataFrame,
+        *,
+        columns: Columns | None = None,
+        name: str | None = None,
+        units: Units | None = None,
+        resolution: float | int | Sequence[float] | np.ndarray | None = None,
+        gaps: Gaps = "refuse",
+    ) -> "Recording":
+        """A recording from a DataFrame, checked.
+
+        **Arguments:**
+
+        - `frame`: one row for each sample, columns as in `jaxid.read`.
+        - `columns`, `units`, `gaps`: as in `jaxid.read`.
+        - `name`, `resolution`: as in `from_arrays`; where None, what `to_dataframe` noted.
+
+        **Raises:** `RecordingError` for whatever makes it unusable.
+        """
+        name = str(name or frame.attrs.get("name") or "recording")
+        resolution = frame.attrs.get("resolution") if resolution is None else resolution
+        picked = pick(name, from_frame(name, frame), columns)
+        return build(name, name, picked, units, resolution, gaps)
+
+    @property
+    def samples(self) -> int:
+        """How many samples it has."""
+        return self.q.shape[0]
+
+    @property
+    def joints(self) -> int:
+        """How many joints it has."""
+        return self.q.shape[1]
+
+    @property
+    def duration(self) -> float:
+        """From the first to the last sample, s."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def period(self) -> float:
+        """Median time between samples, s."""
+        return float(np.median(np.diff(self.time)))
+
+    @property
+    def rate(self) -> float:
+        """Samples in a second, Hz."""
+        return 1 / self.period
+
+    def slice(self, start_s: float | int | None, stop_s: float | int | None) -> "Recording":
+        """The samples with `start_s <= time < stop_s`, their times unchanged.
+
+        **Arguments:**
+
+        - `start_s`, `stop_s`: times, s; None for the recording's own start or end.
+
+        **Raises:** `RecordingError` when the window holds fewer than two samples.
+        """
+        start = 0 if start_s is None else np.searchsorted(self.time, start_s)
+        stop = self.samples if stop_s is None else np.searchsorted(self.time, stop_s)
+        if stop - start < 2:
+            raise problem(
+                self.name,
+                f"fewer than two samples lie between {start_s} and {stop_s} s",
+                f"choose a window within {self.time[0]:.6g} and {self.time[-1]:.6g} s",
+            )
+        cut = {signal: values[start:stop] for signal, values in _signals(self).items()}
+        return Recording(**cut, resolution=self.resolution, name=self.name)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row for each sample; `from_dataframe` gives the same recording back."""
+        columns = {}
+        for signal, values in _signals(self).items():
+            if signal == "time":
+                columns["time"] = values
+            else:
+                columns |= {f"{signal}_{k}": column for k, column in enumerate(values.T, start=1)}
+        frame = pd.DataFrame(columns)
+        frame.attrs["name"] = self.name
+        if self.resolution is not None:
+            frame.attrs["resolution"] = self.resolution.tolist()
+        return frame
+
+    def __repr__(self) -> str:
+        joints = "1 joint" if self.joints == 1 else f"{self.joints} joints"
+        return (
+            f"Recording({self.name!r}: {joints}, {self.samples} samples, "
+            f"{self.duration:.1f} s at {self.rate:.4g} Hz)"
+        )
+
+    def _repr_html_(self) -> str:
+        return f"<code>{html.escape(repr(self))}</code>"
+
+
+class Recordings(eqx.Module):
+    """Several recordings of the same robot, each under a name of its own; made by `of`."""
+
+    recordings: tuple[Recording, ...]
+
+    @classmethod
+    def of(cls, recordings: "Recording | Recordings | Iterable[Recording]") -> "Recordings":
+        """Recordings from one, or from several; a repeated name gets a number.
+
+        **Arguments:**
+
+        - `recordings`: a `Recording`, a `Recordings`, or an iterable of `Recording`.
+
+        **Raises:** `RecordingError` when there are none, or their numbers of joints differ.
+        """
+        if isinstance(recordings, Recordings):
+            return recordings
+        several = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
+        if not several:
+            raise problem("Recordings", "there is no recording", "give at least one")
+        for recording in several:
+            if not isinstance(recording, Recording):
+                raise problem(
+                    "Recordings", f"{brief(recording)} is not a Recording", "use jaxid.read first"
+                )
+            if recording.joints != several[0].joints:
+                raise problem(
+                    recording.name,
+                    f"it has {recording.joints} joints where {several[0].name} has "
+                    f"{several[0].joints}",
+                    "read recordings of different robots apart",
+                )
+        names = _distinct([recording.name for recording in several])
+        return cls(tuple(map(_renamed, several, names)))
+
+    @property
+    def joints(self) -> int:
+        """How many joints each recording has."""
+        return self.recordings[0].joints
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What the recordings are called, each differently."""
+        return tuple(recording.name for recording in self.recordings)
+
+    def __iter__(self) -> Iterator[Recording]:
+        return iter(self.recordings)
+
+    def __len__(self) -> int:
+        return len(self.recordings)
+
+    @overload
+    def __getitem__(self, key: int | str) -> Recording: ...
+
+    @overload
+    def __getitem__(self, key: slice) -> "Recordings": ...
+
+    def __getitem__(self, key: int | str | slice) -> "Recording | Recordings":
+        if isinstance(key, slice):
+            return Recordings.of(self.recordings[key])
+        if isinstance(key, int):
+            return self.recordings[key]
+        if key not in self.names:
+            raise problem(
+                "Recordings",
+                f"there is no recording {brief(key)}{near(key, self.names)}",
+                f"choose from {brief(list(self.names))}",
+            )
+        return self.recordings[self.names.index(key)]
+
+    def __repr__(self) -> str:
+        return "Recordings(" + ", ".join(map(repr, self.recordings)) + ")"
+
+    def _repr_html_(self) -> str:
+        items = "".join(f"<li>{recording._repr_html_()}</li>" for recording in self.recordings)
+        return f"<ol>{items}</ol>"
+
+
+def build(
+    source: str,
+    name: str,
+    picked: Picked,
+    units: Units | None,
+    resolution: float | int | Sequence[float] | np.ndarray | None,
+    gaps: Gaps,
+) -> Recording:
+    """A recording of signals that were found, once they pass all checks.
+
+    **Arguments:**
+
+    - `source`: what messages call it, e.g. its path.
+    - `name`: the recording's name.
+    - `picked`: the signals, in the units of the file.
+    - `units`, `resolution`, `gaps`: as in `jaxid.read`.
+
+    **Raises:** `RecordingError` for whatever makes them unusable.
+    """
+    signals = validate(source, picked.signals, picked.labels, units, gaps)
+    joints = signals["q"].shape[1]
+    step = quantum(signals["q"]) if picked.quantised else None
+    if resolution is not None:
+        step = numeric(source, "resolution", resolution)
+        if step.shape not in ((), (1,), (joints,)) or not np.all((step > 0) & np.isfinite(step)):
+            raise problem(
+                source,
+                f"resolution is {brief(resolution)}",
+                f"give one positive step, or {joints}, in rad or m",
+            )
+        step = np.broadcast_to(step, (joints,)).copy()
+    return Recording(**signals, resolution=step, name=name)
+
+
+def _signals(recording: Recording) -> dict[str, Float64[np.ndarray, "..."]]:
+    values = {signal: getattr(recording, signal) for signal in SIGNALS}
+    return {signal: value for signal, value in values.items() if value is not None}
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    taken, distinct = set(names), []
+    for name in names:
+        numbered = (f"{name}_{k}" for k in itertools.count(2))
+        own = next(n for n in numbered if n not in taken) if name in distinct else name
+        taken.add(own)
+        distinct.append(own)
+    return distinct
+
+
+def _renamed(recording: Recording, name: str) -> Recording:
+    if recording.name == name:
+        return recording
+    return Recording(**_signals(recording), resolution=recording.resolution, name=name)

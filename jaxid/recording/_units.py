@@ -1,0 +1,85 @@
+"""The units a file may come in, and what they are in SI."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from ._problem import near, problem
+
+_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+_POSITION = {
+    "rad": 1.0,
+    "mrad": 1e-3,
+    "deg": math.pi / 180,
+    "turn": 2 * math.pi,
+    "m": 1.0,
+    "mm": 1e-3,
+}
+_VELOCITY = {f"{unit}/s": factor for unit, factor in _POSITION.items()} | {"rpm": math.pi / 30}
+_TORQUE = {"Nm": 1.0, "mNm": 1e-3, "Nmm": 1e-3, "kNm": 1e3, "N": 1.0, "kN": 1e3}
+
+# Every signal a recording can hold, with the units it may come in. The order is that of columns.
+SIGNALS: Mapping[str, Mapping[str, float]] = {
+    "time": _TIME,
+    "q": _POSITION,
+    "q_ref": _POSITION,
+    "tau": _TORQUE,
+    "v": _VELOCITY,
+    "tau_ff": _TORQUE,
+}
+
+# What is measured with the same instrument comes in the same unit unless said otherwise.
+_SAME_UNIT_AS = {"q_ref": "q", "tau_ff": "tau"}
+
+Units = Mapping[str, str | Sequence[str]]
+
+
+def factors(source: str, units: Units | None) -> dict[str, Float64[np.ndarray, " units"]]:
+    """What to multiply each signal with to get SI.
+
+    **Arguments:**
+
+    - `source`: the file or recording the units are for.
+    - `units`: unit by signal, one for all joints or one for each.
+
+    **Returns:** factors by signal; one, or one for each joint.
+
+    **Raises:** `RecordingError` for a signal or a unit that is not known.
+    """
+    given = dict(units or {})
+    for signal in given:
+        if signal not in SIGNALS:
+            raise problem(
+                source,
+                f"units names {signal!r}{near(signal, SIGNALS)}",
+                f"give units for {', '.join(SIGNALS)} only",
+            )
+    for signal, other in _SAME_UNIT_AS.items():
+        if signal not in given and other in given:
+            given[signal] = given[other]
+    return {signal: _factor(source, signal, given.get(signal)) for signal in SIGNALS}
+
+
+def _factor(
+    source: str, signal: str, unit: str | Sequence[str] | None
+) -> Float64[np.ndarray, " units"]:
+    if unit is None:
+        return np.ones(1)
+    known = SIGNALS[signal]
+    names = [unit] if isinstance(unit, str) else list(unit)
+    for name in names:
+        if _plain(name) not in known:
+            raise problem(
+                source,
+                f"{name!r} is not a unit known for {signal}{near(_plain(name), known)}",
+                f"use one of {', '.join(known)}",
+            )
+    return np.array([known[_plain(name)] for name in names])
+
+
+def _plain(unit: str) -> str:
+    # N·m is typed in many ways, and micro has two code points.
+    dotless = unit.translate(str.maketrans("", "", "·⋅.* "))
+    return dotless.replace("µ", "u").replace("μ", "u").replace("°", "deg").replace("rev", "turn")

@@ -1,0 +1,429 @@
+"""Simulation of a loop along recordings, and its exact sensitivities."""
+
+import dataclasses
+import zlib
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+from scipy import interpolate
+
+from .control import Reading, Reference
+from .errors import RecordingError
+from .loop import ClosedLoop, Instant, State, instant, rest
+from .recording import Recording, Recordings
+from .stepping import flow
+
+
+class Interval(eqx.Module):
+    """What drives the loop from one grid point to the next; the last interval has no length.
+
+    `reference` holds the coefficients of the interval's cubic, `torque` those of a line; `noise`
+    is added to what the sensors read and `push` to the torque at the joints, each given at both
+    ends and joined by a line, or None.
+    """
+
+    t0: Float[Array, ""]
+    h: Float[Array, ""]
+    tick: Bool[Array, ""]
+    label: Int[Array, ""]
+    reference: Float[Array, "4 joints"]
+    torque: Float[Array, "2 joints"]
+    noise: Float[Array, "2 joints"] | None = None
+    push: Float[Array, "2 joints"] | None = None
+
+
+class Batch(eqx.Module):
+    """Recordings padded to one length, so that one `vmap` covers them.
+
+    `intervals` has `(recordings, points)` before the axes of each leaf. `at` says which grid points are samples, `mask` which of those are there; the initial state
+    is `q0`, `v0`; `q`, `tau` are the measured signals.
+    """
+
+    intervals: Interval
+    at: Int[Array, "recordings samples"] | None
+    mask: Bool[Array, "recordings samples"]
+    q0: Float[Array, "recordings joints"]
+    v0: Float[Array, "recordings joints"]
+    time: Float[Array, "recordings samples"]
+    q: Float[Array, "recordings samples joints"]
+    tau: Float[Array, "recordings samples joints"]
+
+
+class Simulated(eqx.Module):
+    """Signals of one simulation at the samples, `(samples, joints)`, in SI units.
+
+    `q` and `v` are what the sensors read, `tau` the commanded torque as it is recorded, `a` the
+    acceleration of the drives and `delivered` their torque. `states` is the whole state,
+    `(samples, states)`.
+    """
+
+    time: Float[Array, "*batch samples"]
+    q: Float[Array, "*batch samples joints"]
+    v: Float[Array, "*batch samples joints"]
+    a: Float[Array, "*batch samples joints"]
+    tau: Float[Array, "*batch samples joints"]
+    delivered: Float[Array, "*batch samples joints"]
+    states: Float[Array, "*batch samples states"]
+
+
+def recording_label(name: str) -> int:
+    """The number by which effects know a recording of that name."""
+    return zlib.crc32(name.encode()) & 0x7FFFFFFF
+
+
+# --- from recordings to a batch (host side, NumPy) ---------------------------------------------
+
+
+def _pieces(
+    time: np.ndarray, values: np.ndarray, at: np.ndarray, kind: str, order: int
+) -> np.ndarray:
+    """Taylor coefficients of an interpolant at the grid points, `(points, order + 1, joints)`."""
+    beyond = np.append(time, time[-1] + 1.0)
+    if kind == "cubic" and order == 3:
+        spline = interpolate.CubicSpline(time, values)
+    else:
+        slope = np.zeros_like(values)
+        if kind != "hold":
+            slope[:-1] = np.diff(values, axis=0) / np.diff(time)[:, None]
+        spline = interpolate.PPoly(np.stack([slope, values]), beyond)
+    factorial = (1.0, 1.0, 2.0, 6.0)
+    return np.stack([spline(at, nu) / factorial[nu] for nu in range(order + 1)], axis=1)
+
+
+def _grid(recording: Recording, period: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Grid times and which of them are ticks: the samples, and the controller's own instants."""
+    time = recording.time
+    if period is None:
+        return time, np.zeros(len(time), bool)
+    ticks = time[0] + period * np.arange(int((time[-1] - time[0]) / period + 1e-6) + 1)
+    # Instants closer than a thousandth of a period are the same: clocks are written in decimals.
+    near = time[np.clip(np.searchsorted(time, ticks - 1e-3 * period), 0, len(time) - 1)]
+    ticks = np.where(np.abs(near - ticks) < 1e-3 * period, near, ticks)
+    grid = np.union1d(time, ticks)
+    return grid, np.isin(grid, ticks)
+
+
+def _drive(
+    loop: ClosedLoop,
+    recording: Recording,
+    points: tuple[np.ndarray, np.ndarray],
+    length: int,
+    noise: np.ndarray | None,
+) -> tuple[np.ndarray | None, ...]:
+    """The fields of the intervals of one recording, each with `length` points."""
+    grid, ticks = points
+    signals = loop.controller.signals(recording)
+    kind = loop.stepping.interpolation
+    pad = length - len(grid)
+
+    def padded(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([values, np.repeat(values[-1:], pad, axis=0)])
+
+    ends = None
+    if noise is not None:
+        at_points = padded(_pieces(recording.time, noise, grid, "linear", 1)[:, 0])
+        ends = np.stack([at_points, np.append(at_points[1:], at_points[-1:], axis=0)], axis=1)
+    return (
+        padded(grid),
+        np.append(np.diff(grid), np.zeros(pad + 1)),
+        np.append(ticks, np.zeros(pad, bool)),
+        np.full(length, recording_label(recording.name)),
+        padded(_pieces(recording.time, signals.q, grid, kind, 3)),
+        padded(_pieces(recording.time, signals.tau, grid, "linear", 1)),
+        ends,
+    )
+
+
+def start_of(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity at the first sample, `(joints,)`: a line through the first few."""
+    few = min(8, recording.samples)
+    t = recording.time[:few] - recording.time[0]
+    slope, level = np.polyfit(t, recording.q[:few], 1)
+    if recording.v is not None:
+        slope = recording.v[:few].mean(0)
+        level = recording.q[0]
+    return level, slope
+
+
+def at_rest(recording: Recording) -> bool:
+    """Whether the arm does not move over the first samples, beyond noise of the encoder."""
+    few = min(8, recording.samples)
+    moved = np.ptp(recording.q[:few], axis=0)
+    span = np.ptp(recording.q, axis=0)
+    return bool(np.all(moved < 2e-3 * span))
+
+
+def prepare(
+    loop: ClosedLoop,
+    recordings: Recordings | Sequence[Recording],
+    noise: Sequence[np.ndarray] | None = None,
+) -> Batch:
+    """Recordings as one batch for a loop.
+
+    **Arguments:**
+
+    - `loop`: which controller, and how to interpolate.
+    - `recordings`: with as many joints as the loop.
+    - `noise`: added to what the sensors read, `(samples, joints)` for each recording.
+
+    **Raises:** `RecordingError` where the joints do not match, `ModelError` from the controller.
+    """
+    if recordings[0].joints != loop.joints:
+        raise RecordingError(
+            f"{recordings[0].name} has {recordings[0].joints} joints, but the robot {loop.name} has "
+            f"{loop.joints}: choose another robot, or name the columns of its joints"
+        )
+    period = loop.controller.period
+    grids = [_grid(r, period) for r in recordings]
+    length = max(len(grid) for grid, _ in grids)
+    samples = max(r.samples for r in recordings)
+    noises = [None] * len(recordings) if noise is None else list(noise)
+    rows = [
+        _drive(loop, r, g, length, e) for r, g, e in zip(recordings, grids, noises, strict=True)
+    ]
+    fields = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *rows)
+    intervals = jax.vmap(jax.vmap(Interval))(*fields)
+    on_grid = all(len(grid) == r.samples for r, (grid, _) in zip(recordings, grids, strict=True))
+    starts = [(r.q[0], np.zeros(loop.joints)) if at_rest(r) else start_of(r) for r in recordings]
+
+    def stack(pick) -> Array:
+        pieces = [pick(k, r) for k, r in enumerate(recordings)]
+        pads = [np.repeat(p[-1:], samples - len(p), axis=0) for p in pieces]
+        return jnp.asarray(
+            np.stack([np.concatenate(both) for both in zip(pieces, pads, strict=True)])
+        )
+
+    return Batch(
+        intervals,
+        None if on_grid else stack(lambda k, r: np.searchsorted(grids[k][0], r.time)),
+        jnp.arange(samples)[None] < jnp.asarray([r.samples for r in recordings])[:, None],
+        jnp.asarray(np.stack([q for q, _ in starts])),
+        jnp.asarray(np.stack([v for _, v in starts])),
+        stack(lambda k, r: r.time),
+        stack(lambda k, r: r.q),
+        stack(lambda k, r: r.tau),
+    )
+
+
+# --- one interval -------------------------------------------------------------------------------
+
+
+def _line(ends: Float[Array, "2 joints"] | None, dt, h, joints: int) -> Reading:
+    """Value and slope of a line between its two ends."""
+    if ends is None:
+        return Reading(jnp.zeros(joints), jnp.zeros(joints))
+    slope = (ends[1] - ends[0]) / jnp.where(h > 0, h, 1.0)
+    return Reading(ends[0] + dt * slope, slope)
+
+
+def _reference(interval: Interval, dt: Float[Array, ""]) -> Reference:
+    c0, c1, c2, c3 = interval.reference
+    q = c0 + dt * (c1 + dt * (c2 + dt * c3))
+    v = c1 + dt * (2 * c2 + 3 * dt * c3)
+    a = 2 * c2 + 6 * dt * c3
+    return Reference(q, v, a, interval.torque[0] + dt * interval.torque[1])
+
+
+def _instant_at(loop: ClosedLoop, interval: Interval, t: Float[Array, ""], state: State) -> Instant:
+    dt = t - interval.t0
+    noise = _line(interval.noise, dt, interval.h, loop.joints)
+    push = _line(interval.push, dt, interval.h, loop.joints).q
+    return instant(loop, t, state, _reference(interval, dt), push, noise, interval.label)
+
+
+def unflatten(loop: ClosedLoop) -> Callable[[Float[Array, " states"]], State]:
+    """The function that makes a state of a flat vector, `(states,)`."""
+    zeros = jnp.zeros(loop.joints)
+    return ravel_pytree(rest(loop, zeros, zeros))[1]
+
+
+def initial(
+    loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]
+) -> Float[Array, " states"]:
+    """The flat state at a position and velocity with all else at rest, `(states,)`."""
+    return ravel_pytree(rest(loop, q, v))[0]
+
+
+def advance(
+    loop: ClosedLoop, interval: Interval, x: Float[Array, " states"]
+) -> tuple[Float[Array, " states"], Float[Array, "5 joints"]]:
+    """One interval: the state at its end, and what is to be seen at its start.
+
+    **Arguments:**
+
+    - `interval`: what drives the loop.
+    - `x`: the state at its start, flat, `(states,)`.
+
+    **Returns:** the state, `(states,)`, and the rows of `SIGNALS`, `(5, joints)`.
+    """
+    unravel = unflatten(loop)
+    state = unravel(x)
+    if loop.controller.period is not None:
+        now = _instant_at(loop, interval, interval.t0, state)
+        asked = _reference(interval, jnp.zeros(()))
+        ticked = loop.controller.tick(now.reading, asked, state.controller)
+        held = jnp.where(interval.tick, ticked, state.controller)
+        state = State(state.q, state.v, state.effects, held)
+    now = _instant_at(loop, interval, interval.t0, state)
+
+    def field(t, y, args):
+        return ravel_pytree(_instant_at(loop, interval, t, unravel(y)).derivative)[0]
+
+    after = flow(loop.stepping, field, interval.t0, interval.h, ravel_pytree(state)[0])
+    seen = jnp.stack([now.command, now.reading.q, now.reading.v, now.a, now.tau])
+    return after, seen
+
+
+# --- whole runs ---------------------------------------------------------------------------------
+
+SIGNALS = ("tau", "q", "v", "a", "delivered")
+
+
+def run(
+    loop: ClosedLoop, intervals: Interval, x0: Float[Array, " states"]
+) -> tuple[Float[Array, "points states"], Float[Array, "points 5 joints"]]:
+    """One run from a flat initial state: states and signals at every grid point."""
+
+    def body(x, interval):
+        after, seen = advance(loop, interval, x)
+        return after, (x, seen)
+
+    return jax.lax.scan(body, x0, intervals)[1]
+
+
+def run_with_sensitivities(
+    loop: ClosedLoop,
+    intervals: Interval,
+    x0: Float[Array, " states"],
+    start: Float[Array, "states columns"],
+    rows: tuple[int, ...],
+) -> tuple[Float[Array, "points rows joints"], Float[Array, "points rows joints columns"]]:
+    """One run, and the exact derivative of its signals by the loop's free parameters.
+
+    Along the run the discrete loop is linear: with one interval x' = f(x, theta), sensitivities
+    obey S' = df/dx S + df/dtheta. The Jacobians of all intervals come from one `vmap`.
+
+    **Arguments:**
+
+    - `intervals`, `x0`: as in `run`.
+    - `start`: derivative of `x0` by the parameters, and by whatever columns come after them,
+      `(states, columns)`.
+    - `rows`: which of `SIGNALS`.
+    """
+    theta, picked = loop.theta, jnp.asarray(rows)
+    states, _ = run(loop, intervals, x0)
+    n, p = x0.shape[0], theta.shape[0]
+
+    def one(z, interval):
+        after, seen = advance(loop.with_theta(z[n:]), interval, z[:n])
+        return (after, seen[picked]), seen[picked]
+
+    def linear(x, interval):
+        return jax.jacfwd(one, has_aux=True)(jnp.concatenate([x, theta]), interval)
+
+    (after, seen_by), seen = jax.vmap(linear)(states, intervals)
+    extra = start.shape[1] - p
+
+    def body(s, jacobian):
+        forced = jnp.pad(jacobian[:, n:], ((0, 0), (0, extra)))
+        return jacobian[:, :n] @ s + forced, s
+
+    _, history = jax.lax.scan(body, start, after)
+    direct = jnp.pad(seen_by[..., n:], ((0, 0), (0, 0), (0, 0), (0, extra)))
+    return seen, jnp.einsum("krjx,kxp->krjp", seen_by[..., :n], history) + direct
+
+
+@eqx.filter_jit
+def _simulate(loop: ClosedLoop, batch: Batch) -> Simulated:
+    def one(intervals, at, q0, v0, time):
+        states, seen = run(loop, intervals, initial(loop, q0, v0))
+        if at is not None:
+            states, seen = states[at], seen[at]
+        tau, q, v, a, delivered = jnp.moveaxis(seen, 1, 0)
+        return Simulated(time, q, v, a, tau, delivered, states)
+
+    return jax.vmap(one)(batch.intervals, batch.at, batch.q0, batch.v0, batch.time)
+
+
+def simulate(
+    loop: ClosedLoop,
+    recordings: Recording | Recordings | Sequence[Recording],
+    *,
+    noise: Sequence[np.ndarray] | None = None,
+) -> tuple[Simulated, ...]:
+    """Simulates the loop along recordings: their references, their initial states.
+
+    **Arguments:**
+
+    - `loop`: the model.
+    - `recordings`: where references and initial states come from.
+    - `noise`: added to what the sensors read, `(samples, joints)` for each recording; it goes
+      round the loop.
+
+    **Returns:** one `Simulated` for each recording.
+
+    **Raises:** `RecordingError` or `ModelError` where the two do not fit together.
+    """
+    recordings = Recordings.of(recordings)
+    loop = with_substeps(loop, recordings)
+    together = _simulate(loop, prepare(loop, recordings, noise))
+    return tuple(
+        jax.tree.map(lambda leaf, k=k, r=r: np.asarray(leaf[k, : r.samples]), together)
+        for k, r in enumerate(recordings)
+    )
+
+
+def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
+    """The loop with the number of steps between samples settled, where the user left it open.
+
+    A step is at most 2.5 ms, and at most one and a half time constants of the fastest mode met
+    with friction at its steepest, at standstill.
+    """
+    if loop.stepping.substeps is not None:
+        return loop
+    period = loop.controller.period
+    longest = max(r.period for r in recordings)
+    interval = longest if period is None else min(longest, period)
+    rate = fastest_rate(loop, recordings)
+    substeps = int(np.ceil(max(interval / 2.5e-3, interval * rate / 1.5) - 1e-9))
+    return set_substeps(loop, int(np.clip(substeps, 1, 64)))
+
+
+def set_substeps(loop: ClosedLoop, substeps: int) -> ClosedLoop:
+    """The loop with that many steps between two grid points."""
+    stepping = dataclasses.replace(loop.stepping, substeps=substeps)
+    return dataclasses.replace(loop, stepping=stepping)
+
+
+def fastest_rate(loop: ClosedLoop, recordings: Recordings) -> float:
+    """Largest eigenvalue of the loop's equations at standstill along the recordings, 1/s."""
+    q = np.concatenate([r.q[:: max(1, r.samples // 8)] for r in recordings])
+    return float(_fastest(loop, jnp.asarray(q)))
+
+
+@eqx.filter_jit
+def _slopes(loop: ClosedLoop, q: Float[Array, "points joints"]) -> Float[Array, "points n n"]:
+    n = loop.joints
+    zeros = jnp.zeros(n)
+
+    def rate(x, at):
+        reference = Reference(at, zeros, zeros, zeros)
+        state = unflatten(loop)(x)
+        now = instant(loop, jnp.zeros(()), state, reference, zeros, Reading(zeros, zeros), NOBODY)
+        return ravel_pytree(now.derivative)[0]
+
+    return jax.vmap(lambda at: jax.jacfwd(rate)(initial(loop, at, zeros), at))(q)
+
+
+def _fastest(loop: ClosedLoop, q: Float[Array, "points joints"]) -> float:
+    slopes = np.asarray(_slopes(loop, q))
+    usable = slopes[np.isfinite(slopes).all(axis=(1, 2))]
+    return float(np.abs(np.linalg.eigvals(usable)).max()) if len(usable) else 0.0
+
+
+NOBODY = jnp.asarray(0)

@@ -1,0 +1,49 @@
+"""Set up JAX and shape checking before anything imports jaxid; fixtures for shared recordings."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import jaxtyping
+import pytest
+
+
+def _configure_jax() -> None:
+    """Keep each worker to one thread, and compiled programs between workers and runs."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # A handful of states never fills a thread pool, and the workers already use every core.
+    flag = "--xla_cpu_multi_thread_eigen=false"
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_cpu_multi_thread_eigen" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {flag}".strip()
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxid-tests"
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
+
+_configure_jax()
+jaxtyping.install_import_hook("jaxid", "beartype.beartype")
+
+SHARED_DATA = Path(__file__).parents[1].parent / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of the recordings kept beside the checkout; skips where it is absent."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip("no ../shared/data beside the checkout")
+    return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def shared_file() -> Callable[[str], Path]:
+    """Give a function from a path below ../shared/data to the file; it skips where absent."""
+
+    def find(name: str) -> Path:
+        path = SHARED_DATA / name
+        if not path.exists():
+            pytest.skip(f"no ../shared/data/{name} beside the checkout")
+        return path
+
+    return find
