@@ -19,6 +19,7 @@ from .parameters import (
     list_parameters,
     read_values,
     set_by_name,
+    sliding_unit,
     write_values,
 )
 from .stepping import Stepping
@@ -89,6 +90,12 @@ class ClosedLoop(eqx.Module):
     def names(self) -> tuple[str, ...]:
         """One name for each value that a fit estimates."""
         return tuple(name for p in self.free_parameters for name in p.names)
+
+    def unit(self, parameter: Parameter) -> str:
+        """A parameter's unit, where its joint slides in m and N."""
+        unit, joint = parameter.declaration.unit, parameter.joint
+        slides = joint is not None and self.arm.prismatic()[joint - 1]
+        return sliding_unit(unit) if slides else unit
 
     @property
     def theta(self) -> Vector:

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -12,8 +12,11 @@ from jaxtyping import Array, Float
 
 from .errors import ModelError
 
-Scalar = Float[Array, ""]
-"""A parameter's value: a float64 array without axes."""
+if TYPE_CHECKING:
+    # Fields take numbers and hold arrays: their converter is out of a type checker's sight.
+    Scalar: TypeAlias = Any
+else:
+    Scalar = Float[Array, ""]
 
 Vector = Float[Array, " parameters"]
 
@@ -75,6 +78,7 @@ class Parameter(eqx.Module):
     name: str = eqx.field(static=True)
     declaration: Declaration = eqx.field(static=True)
     where: Callable[[Any], Any] = eqx.field(static=True)
+    joint: int | None = eqx.field(static=True, default=None)
     size: int = eqx.field(static=True, default=1)
     several: bool = eqx.field(static=True, default=False)
 
@@ -84,6 +88,11 @@ class Parameter(eqx.Module):
         if not self.several:
             return [self.name]
         return [f"{self.name}[{k}]" for k in range(1, self.size + 1)]
+
+
+def sliding_unit(unit: str) -> str:
+    """The unit of a parameter declared for a turning joint when its joint slides: N·m to N."""
+    return unit.replace("N·m", "N").replace("rad", "m").replace("kg·m²", "kg")
 
 
 class _Path(eqx.Module):
@@ -129,7 +138,7 @@ def list_parameters(model: Any) -> tuple[Parameter, ...]:
             name = f"{name}_{taken[name]}"
         size = math.prod(value.shape) if hasattr(value, "shape") else 1
         several = bool(getattr(value, "shape", ()))
-        found.append(Parameter(name, declaration, where, size, several))
+        found.append(Parameter(name, declaration, where, joint, size, several))
     return tuple(found)
 
 

@@ -40,8 +40,9 @@ class Interval(eqx.Module):
 class Batch(eqx.Module):
     """Recordings padded to one length, so that one `vmap` covers them.
 
-    `intervals` has `(recordings, points)` before the axes of each leaf. `at` says which grid points are samples, `mask` which of those are there; the initial state
-    is `q0`, `v0`; `q`, `tau` are the measured signals.
+    `intervals` has `(recordings, points)` before the axes of each leaf. `at` says which grid
+    points are samples, `mask` which of those are there; the initial state is `q0`, `v0`; `q`,
+    `tau` are the measured signals.
     """
 
     intervals: Interval
@@ -62,13 +63,13 @@ class Simulated(eqx.Module):
     `(samples, states)`.
     """
 
-    time: Float[Array, "*batch samples"]
-    q: Float[Array, "*batch samples joints"]
-    v: Float[Array, "*batch samples joints"]
-    a: Float[Array, "*batch samples joints"]
-    tau: Float[Array, "*batch samples joints"]
-    delivered: Float[Array, "*batch samples joints"]
-    states: Float[Array, "*batch samples states"]
+    time: Float[Array | np.ndarray, "*batch samples"]
+    q: Float[Array | np.ndarray, "*batch samples joints"]
+    v: Float[Array | np.ndarray, "*batch samples joints"]
+    a: Float[Array | np.ndarray, "*batch samples joints"]
+    tau: Float[Array | np.ndarray, "*batch samples joints"]
+    delivered: Float[Array | np.ndarray, "*batch samples joints"]
+    states: Float[Array | np.ndarray, "*batch samples states"]
 
 
 def recording_label(name: str) -> int:
@@ -140,22 +141,21 @@ def _drive(
 
 
 def start_of(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Position and velocity at the first sample, `(joints,)`: a line through the first few."""
-    few = min(8, recording.samples)
+    """Position and velocity at the first sample, `(joints,)`: a parabola through the first ten."""
+    few = min(10, recording.samples)
     t = recording.time[:few] - recording.time[0]
-    slope, level = np.polyfit(t, recording.q[:few], 1)
-    if recording.v is not None:
-        slope = recording.v[:few].mean(0)
-        level = recording.q[0]
-    return level, slope
+    _, slope, level = np.polyfit(t, recording.q[:few], 2)
+    return (level, slope) if recording.v is None else (level, recording.v[:3].mean(axis=0))
 
 
 def at_rest(recording: Recording) -> bool:
-    """Whether the arm does not move over the first samples, beyond noise of the encoder."""
-    few = min(8, recording.samples)
-    moved = np.ptp(recording.q[:few], axis=0)
-    span = np.ptp(recording.q, axis=0)
-    return bool(np.all(moved < 2e-3 * span))
+    """Whether the arm starts with less than a hundredth of its highest speed."""
+    _, start = start_of(recording)
+    step = 10
+    speed = (recording.q[step:] - recording.q[:-step]) / (
+        recording.time[step:] - recording.time[:-step]
+    )[:, None]
+    return bool(np.all(np.abs(start) < 1e-2 * np.abs(speed).max(axis=0)))
 
 
 def prepare(
@@ -175,8 +175,8 @@ def prepare(
     """
     if recordings[0].joints != loop.joints:
         raise RecordingError(
-            f"{recordings[0].name} has {recordings[0].joints} joints, but the robot {loop.name} has "
-            f"{loop.joints}: choose another robot, or name the columns of its joints"
+            f"{recordings[0].name} has {recordings[0].joints} joints, but the robot {loop.name} "
+            f"has {loop.joints}: choose another robot, or name the columns of its joints"
         )
     period = loop.controller.period
     grids = [_grid(r, period) for r in recordings]

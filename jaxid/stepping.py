@@ -45,7 +45,7 @@ class RK4(diffrax.AbstractSolver):
         y1 = jax.tree.map(
             lambda y, a, b, c, d: y + h / 6 * (a + 2 * b + 2 * c + d), y0, k1, k2, k3, k4
         )
-        return y1, None, dict(y0=y0, y1=y1), None, diffrax.RESULTS.successful
+        return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
 
 class Stepping(eqx.Module):

@@ -36,9 +36,17 @@ class AbstractArm(eqx.Module):
     ) -> Float[Array, "joints parameters"]:
         """Derivative of the torque by the base parameters, in the order of the fields."""
 
-    def potential_axes(self) -> tuple[str, ...]:
-        """Units of the joint coordinates, `"rad"` or `"m"`, one a joint."""
-        return ("rad",) * self.joints
+    def prismatic(self) -> tuple[bool, ...]:
+        """Which joints slide, one a joint; the others turn."""
+        return (False,) * self.joints
+
+    def units(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Units of torque and of position, one a joint each."""
+        slides = self.prismatic()
+        return (
+            tuple("N" if slide else "N·m" for slide in slides),
+            tuple("m" if slide else "rad" for slide in slides),
+        )
 
     def workspace(self) -> Float[np.ndarray, "points joints"]:
         """Positions over which the mass matrix must be positive definite, `(points, joints)`."""

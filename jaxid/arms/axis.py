@@ -18,9 +18,9 @@ class Axis(AbstractArm):
         """One."""
         return 1
 
-    def potential_axes(self) -> tuple[str, ...]:
-        """Metres."""
-        return ("m",)
+    def prismatic(self) -> tuple[bool, ...]:
+        """It slides."""
+        return (True,)
 
     def workspace(self) -> Float[np.ndarray, "points joints"]:
         """The inertia is the same everywhere."""

@@ -34,8 +34,8 @@ class Cascade(AbstractController):
 
     def initial_state(self, reading: Reading) -> Float[Array, " states"]:
         """Positions at the last two ticks, the command to record and the one that acts, `(4,)`."""
-        q, zero = reading.q[0], jnp.zeros(())
-        return jnp.stack([q, q, zero, zero])
+        q, step, zero = reading.q[0], reading.v[0] * self.every, jnp.zeros(())
+        return jnp.stack([q - step, q - 2 * step, zero, zero])
 
     def tick(
         self, reading: Reading, reference: Reference, state: Float[Array, " states"]

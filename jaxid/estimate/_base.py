@@ -74,7 +74,7 @@ class Fit(eqx.Module):
     @property
     def units(self) -> tuple[str, ...]:
         """One unit for each value."""
-        return tuple(p.declaration.unit for p in self.loop.free_parameters for _ in p.names)
+        return tuple(self.loop.unit(p) for p in self.loop.free_parameters for _ in p.names)
 
     def table(self) -> pd.DataFrame:
         """Value, unit, standard deviation and relative deviation (A.4) of each parameter."""
@@ -88,18 +88,15 @@ class Fit(eqx.Module):
 
     def to_dict(self) -> dict[str, Any]:
         """Everything a report needs, as plain JSON."""
-        rows = self.table()
         return {
             "robot": self.loop.name,
             "method": repr(self.method),
             "status": self.status.name,
             "parameters": {
-                str(name): {
-                    "value": float(row["value"]),
-                    "std": float(row["std"]) if np.isfinite(row["std"]) else None,
-                    "unit": row["unit"],
-                }
-                for name, row in rows.iterrows()
+                name: {"value": value, "std": std if np.isfinite(std) else None, "unit": unit}
+                for name, value, std, unit in zip(
+                    self.names, self.theta.tolist(), self.std.tolist(), self.units, strict=True
+                )
             },
             "error_percent": errors_to_dict(self.error_percent),
             "deviations": self.deviations,
@@ -195,15 +192,16 @@ def determined_covariance(
     covariance = inverse if meat is None else inverse @ meat @ inverse
     lost = np.zeros(len(names), bool)
     sentences = []
-    for k in np.flatnonzero(weak):
-        along = vectors[:, k] / floor
+    for direction in vectors[:, weak].T:
+        along = direction / floor
         along = along / np.abs(along).max()
-        part = np.abs(vectors[:, k]) > 1e-3
+        part = np.abs(direction) > 1e-3
         lost |= part
-        terms = " ".join(f"{along[i]:+.3g}·{names[i]}" for i in np.flatnonzero(part))
+        involved = [(name, x) for name, x, on in zip(names, along, part, strict=True) if on]
+        terms = " ".join(f"{x:+.3g}·{name}" for name, x in involved)
         sentences.append(
-            f"these recordings do not determine {', '.join(names[i] for i in np.flatnonzero(part))}"
-            f": the signals do not change along {terms}"
+            f"these recordings do not determine {', '.join(name for name, _ in involved)}: "
+            f"the signals do not change along {terms}"
         )
     covariance = np.array(covariance)
     covariance[lost, :] = 0.0

@@ -193,7 +193,7 @@ def minimise(
     - `say`: told about every step.
     """
     carry = _begin(problem, solver, z)
-    best, refused, last = np.inf, 0, None
+    best, refused, still, last = np.inf, 0, 0, None
     for k in range(1, max_steps + 1):
         z, carry, last, loss, done = _step(problem, solver, z, carry)
         loss = float(loss)
@@ -201,8 +201,10 @@ def minimise(
         if k == 1 and loss >= REFUSED**2:
             return Minimum(z, last[0], last[1], Status.diverged, k)
         refused = refused + 1 if loss >= best else 0
+        # A parameter that leans on its bound moves on for ever without changing anything.
+        still = still + 1 if 0 <= best - loss < 1e-9 * loss and not refused else 0
         best = min(best, loss)
-        if bool(done) or (refused >= 3 and flat(last[0])):
+        if bool(done) or still >= 3 or (refused >= 3 and flat(last[0])):
             return Minimum(z, last[0], last[1], Status.converged, k)
         if refused >= 25:
             return Minimum(z, last[0], last[1], Status.stalled, k)

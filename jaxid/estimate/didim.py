@@ -53,8 +53,10 @@ class _Iterated(AbstractMethod):
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
         """Alternates simulation and regression; called by `jaxid.fit`."""
         started = time.perf_counter()
-        status, stacked, solved, before, k = Status.max_steps, None, None, None, 0
-        for k in range(1, self.max_steps + 1):
+        status, stacked, solved, before = Status.max_steps, None, None, None
+        count = 0
+        while count < self.max_steps:
+            count += 1
             runs = simulate(loop, recordings)
             if not all(np.isfinite(run.q).all() and np.isfinite(run.a).all() for run in runs):
                 status = Status.diverged
@@ -71,7 +73,7 @@ class _Iterated(AbstractMethod):
                 f"{type(self).__name__} cannot start: the loop diverges in simulation at its "
                 "initial values; start from the result of IDIM"
             )
-        return regression_fit(loop, recordings, self, stacked, solved, started, status, k)
+        return regression_fit(loop, recordings, self, stacked, solved, started, status, count)
 
 
 class DIDIM(_Iterated):
@@ -89,7 +91,7 @@ class DIDIM(_Iterated):
 
     filtering: Filtering = Filtering()
     weights: Weights = eqx.field(static=True, default="joint")
-    tolerance: float = 1e-3
+    tolerance: float = 0.025
     max_steps: int = eqx.field(static=True, default=20)
 
     def solve_once(
@@ -116,7 +118,7 @@ class IDIMIV(_Iterated):
 
     filtering: Filtering = Filtering()
     weights: Weights = eqx.field(static=True, default="joint")
-    tolerance: float = 1e-3
+    tolerance: float = 0.025
     max_steps: int = eqx.field(static=True, default=20)
 
     def solve_once(

@@ -321,7 +321,7 @@ def _at_bounds(loop: ClosedLoop) -> list[str]:
         value = np.ravel(np.asarray(p.where(loop)))
         for bound, word in ((p.declaration.lower, "lower"), (p.declaration.upper, "upper")):
             if np.isfinite(bound) and np.any(np.abs(value - bound) < 2e-3 * p.declaration.scale):
-                notes.append(f"{p.name} is at its {word} bound, {bound:g} {p.declaration.unit}")
+                notes.append(f"{p.name} is at its {word} bound, {bound:g} {loop.unit(p)}")
     return notes
 
 

@@ -83,7 +83,7 @@ def _levinson(
     most = len(covariance) - 1
     if most == 0:
         return [np.zeros(0)], covariance[:1]
-    _, _, pacf, variances, phi = levinson_durbin(covariance, most, isacov=True)
+    _, _, _, variances, phi = levinson_durbin(covariance, most, isacov=True)
     variances = np.asarray(variances).copy()
     variances[0] = covariance[0]
     predictors = [np.asarray(phi[1 : k + 1, k]) for k in range(most + 1)]

@@ -1,0 +1,218 @@
+"""How well a model predicts recordings, and where it fails."""
+
+import html
+from collections.abc import Iterable
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
+from jaxtyping import Float
+
+from .. import figures
+from ..control import OpenLoop
+from ..errors import FitError, RecordingError
+from ..estimate import Filtering, Fit
+from ..estimate._base import errors_to_dict, joint_columns, relative_errors
+from ..estimate._regression import filtered
+from ..estimate.oem import pieces_of
+from ..loop import ClosedLoop
+from ..noise import autocorrelation
+from ..recording import Recording, Recordings
+from ..simulate import Simulated, simulate
+
+
+class Comparison(eqx.Module):
+    """Measured beside simulated signals.
+
+    - `runs`: the simulated signals, one for each recording.
+    - `errors`: 100 · ‖measured - simulated‖ / ‖measured‖ by recording, signal and joint.
+    """
+
+    loop: ClosedLoop
+    recordings: Recordings
+    runs: tuple[Simulated, ...]
+    errors: pd.DataFrame
+
+    @property
+    def signal(self) -> str:
+        """What is judged: torque, or position where the recorded torque drives the arm."""
+        return "position" if isinstance(self.loop.controller, OpenLoop) else "torque"
+
+    @property
+    def error_percent(self) -> pd.DataFrame:
+        """Relative error by recording and joint, % (Table 3 of Brunot et al. 2016)."""
+        table = self.errors.xs(self.signal, level="signal")
+        assert isinstance(table, pd.DataFrame)
+        return table
+
+    @property
+    def residuals(self) -> tuple[Float[np.ndarray, "samples_ joints"], ...]:
+        """Measured less simulated, one `(samples, joints)` for each recording."""
+        name = "q" if self.signal == "position" else "tau"
+        return tuple(
+            getattr(r, name) - getattr(run, name)
+            for r, run in zip(self.recordings, self.runs, strict=True)
+        )
+
+    def autocorrelation(
+        self, recording: int | str = 0, lags: int = 38
+    ) -> tuple[Float[np.ndarray, "lags_and_zero joints"], float]:
+        """Autocorrelation of each joint's residual from lag 0, and the two-sigma bound."""
+        residual = self.residuals[self._index(recording)]
+        columns = [autocorrelation([x - x.mean()], lags) for x in residual.T]
+        return np.stack([c for c, _ in columns], axis=1), columns[0][1]
+
+    def _index(self, recording: int | str) -> int:
+        if isinstance(recording, int):
+            return range(len(self.recordings))[recording]
+        if recording not in self.recordings.names:
+            raise RecordingError(
+                f"there is no recording {recording!r} in this comparison: it has "
+                f"{', '.join(self.recordings.names)}"
+            )
+        return self.recordings.names.index(recording)
+
+    def plot(self, recording: int | str = 0) -> go.Figure:
+        """Measured, simulated and residual of one recording, with the residual's autocorrelation.
+
+        **Arguments:**
+
+        - `recording`: number from 0, or name.
+        """
+        k = self._index(recording)
+        name = "q" if self.signal == "position" else "tau"
+        acf, bound = self.autocorrelation(k)
+        torque, position = self.loop.arm.units()
+        units = position if self.signal == "position" else torque
+        record = self.recordings[k]
+        percent = self.error_percent.iloc[k]
+        joints = [f"{label} ({percent[label]:.2f} %)" for label in percent.index]
+        return figures.comparison(
+            record.time,
+            getattr(record, name),
+            np.asarray(getattr(self.runs[k], name)),
+            self.residuals[k],
+            acf,
+            bound,
+            joints,
+            list(units),
+            f"{record.name}: {self.signal}, measured and simulated",
+        )
+
+    def plot_errors(self) -> go.Figure:
+        """Relative errors of all recordings as bars."""
+        table = self.error_percent
+        return figures.error_bars(list(table.columns), list(table.index), table.to_numpy())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Relative errors as plain JSON."""
+        return {
+            "robot": self.loop.name,
+            "error_percent": errors_to_dict(self.error_percent),
+            "errors": {
+                signal: errors_to_dict(self.errors.xs(signal, level="signal"))  # type: ignore[arg-type]
+                for signal in self.errors.index.unique("signal")
+            },
+        }
+
+    def __repr__(self) -> str:
+        table = self.errors.to_string(float_format=lambda x: f"{x:.4g}")
+        return f"{self.loop.name}, relative error in %:\n{table}"
+
+    def _repr_html_(self) -> str:
+        head = html.escape(f"{self.loop.name}, relative error in %")
+        return f"<p>{head}</p>{self.errors.to_html(float_format='%.4g')}"
+
+
+def compare(
+    model: Fit | ClosedLoop,
+    recordings: Recording | Recordings | Iterable[Recording],
+    *,
+    window: float | None = None,
+) -> Comparison:
+    """Simulates a model along recordings and holds it against what was measured.
+
+    **Arguments:**
+
+    - `model`: a fit or a loop.
+    - `recordings`: used for the fit or not.
+    - `window`: length in s of pieces that each start from the measured state; by default that of
+      the fit, else whole recordings.
+
+    **Raises:** `RecordingError`, `ModelError` where the two do not fit together; `FitError` where
+    the loop cannot be simulated.
+    """
+    loop = model.loop if isinstance(model, Fit) else model
+    recordings = Recordings.of(recordings)
+    if window is None and isinstance(model, Fit):
+        window = getattr(model.method, "window", None)
+    runs = _simulate_in_windows(loop, recordings, window)
+    for run, recording in zip(runs, recordings, strict=True):
+        if not np.isfinite(run.tau).all() or not np.isfinite(run.q).all():
+            raise FitError(
+                f"the loop {loop.name} diverges when it is simulated along {recording.name}: "
+                "fit it first, or start from other values"
+            )
+    return Comparison(loop, recordings, runs, _errors(loop, recordings, runs))
+
+
+def _simulate_in_windows(
+    loop: ClosedLoop, recordings: Recordings, window: float | None
+) -> tuple[Simulated, ...]:
+    if window is None:
+        return simulate(loop, recordings)
+    runs = []
+    for recording in recordings:
+        pieces = pieces_of(Recordings.of(recording), window)
+        parts = simulate(loop, pieces)
+        cut = [(0 if k == 0 else 1) for k in range(len(parts))]
+        whole = {
+            name: np.concatenate(
+                [getattr(part, name)[first:] for part, first in zip(parts, cut, strict=True)]
+            )
+            for name in Simulated.__dataclass_fields__
+        }
+        runs.append(_padded(Simulated(**whole), recording))
+    return tuple(runs)
+
+
+def _padded(run: Simulated, recording: Recording) -> Simulated:
+    """The last few samples, too few for a window, are left as measured."""
+    missing = recording.samples - len(run.time)
+    if missing == 0:
+        return run
+    values = {}
+    for name in Simulated.__dataclass_fields__:
+        had = getattr(run, name)
+        measured = getattr(recording, name, None)
+        tail = np.repeat(had[-1:], missing, axis=0) if measured is None else measured[-missing:]
+        values[name] = np.concatenate([had, tail])
+    return Simulated(**values)
+
+
+def _errors(loop: ClosedLoop, recordings: Recordings, runs: tuple[Simulated, ...]) -> pd.DataFrame:
+    """Relative errors of position, velocity and torque by recording."""
+    tables = {}
+    pairs = list(zip(recordings, runs, strict=True))
+    position = [r.q for r in recordings]
+    tables["position"] = relative_errors(
+        recordings, position, [r.q - np.asarray(run.q) for r, run in pairs]
+    )
+    # A velocity that was not measured is derived from position without delay.
+    velocity = [filtered(r, Filtering()).v if r.v is None else r.v for r in recordings]
+    tables["velocity"] = relative_errors(
+        recordings,
+        [np.asarray(v) for v in velocity],
+        [np.asarray(v) - np.asarray(run.v) for v, run in zip(velocity, runs, strict=True)],
+    )
+    if not isinstance(loop.controller, OpenLoop):
+        torque = [r.tau for r in recordings]
+        tables["torque"] = relative_errors(
+            recordings, torque, [r.tau - np.asarray(run.tau) for r, run in pairs]
+        )
+    together = pd.concat(tables, names=["signal"]).reorder_levels(["recording", "signal"])
+    columns = joint_columns(loop.joints)
+    order = [(r.name, s) for r in recordings for s in tables]
+    return together.loc[order, columns]
