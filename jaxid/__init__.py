@@ -9,6 +9,8 @@ from . import control as control  # noqa: E402
 from . import effects as effects  # noqa: E402
 from .discovery import Comparison as Comparison  # noqa: E402
 from .discovery import compare as compare  # noqa: E402
+from .effects import Curve as Curve  # noqa: E402
+from .effects import catalogue as catalogue  # noqa: E402
 from .estimate import DIDIM as DIDIM  # noqa: E402
 from .estimate import IDIM as IDIM  # noqa: E402
 from .estimate import IDIMIV as IDIMIV  # noqa: E402

@@ -237,12 +237,26 @@ class Instant(eqx.Module):
 
 
 def effect_load(
-    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...]
+    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...], curves: bool = True
 ) -> Float[Array, " joints"]:
-    """Torque that all effects together ask for at a motion, `(joints,)`."""
+    """Torque that all effects together ask for at a motion, `(joints,)`.
+
+    Effects of the load come last, since they are given what the others leave of the torque.
+    `curves` is False to leave out what needs an acceleration that is not known yet.
+    """
+    own = [
+        (effect, state)
+        for effect, state in zip(loop.effects, states, strict=True)
+        if curves or not effect.needs_acceleration
+    ]
     total = jnp.zeros_like(motion.v)
-    for effect, state in zip(loop.effects, states, strict=True):
-        total = total + effect.torque(dataclasses.replace(motion, state=state))
+    for effect, state in own:
+        if not effect.loaded:
+            total = total + effect.torque(dataclasses.replace(motion, state=state))
+    left = dataclasses.replace(motion, tau=motion.tau - total)
+    for effect, state in own:
+        if effect.loaded:
+            total = total + effect.torque(dataclasses.replace(left, state=state))
     return total
 
 
@@ -318,16 +332,25 @@ def _accelerations(
     loop: ClosedLoop, motion: Motion, state: State, push: Float[Array, " joints"]
 ) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
     """Accelerations of the drives, and of the twist of each transmission by its place."""
+    added = _added_inertia(loop, motion, state.effects)
+    matrix = loop.arm.mass_matrix(state.q) + added
+    bias = loop.arm.bias(state.q, state.v)
+    if any(effect.needs_acceleration for effect in loop.effects):
+        without = motion.tau - effect_load(loop, motion, state.effects, curves=False) + push
+        motion = dataclasses.replace(motion, a=solve_positive(matrix, without - bias))
+    load = effect_load(loop, motion, state.effects)
+    # Inertia is on the left-hand side already.
+    available = motion.tau - load + added @ motion.a + push
+    rigid = solve_positive(matrix, available - bias)
     transmissions = [
         (k, e) for k, e in enumerate(loop.effects) if isinstance(e, AbstractTransmission)
     ]
-    friction = effect_load(loop, motion, state.effects)
-    added = _added_inertia(loop, motion, state.effects)
-    available = motion.tau - friction + push
     if not transmissions:
-        matrix = loop.arm.mass_matrix(state.q) + added
-        return solve_positive(matrix, available - loop.arm.bias(state.q, state.v)), {}
-    return _through_transmissions(loop, state, transmissions, available, added)
+        return rigid, {}
+    soft, twisting = _through_transmissions(loop, state, transmissions, available, added)
+    present = jnp.any(jnp.stack([e.present() for _, e in transmissions]))
+    still = {k: jnp.where(e.present(), twisting[k], 0.0) for k, e in transmissions}
+    return jnp.where(present, soft, rigid), still
 
 
 def _through_transmissions(

@@ -15,13 +15,14 @@ from .errors import ModelError
 if TYPE_CHECKING:
     # Fields take numbers and hold arrays: their converter is out of a type checker's sight.
     Scalar: TypeAlias = Any
+    Vector: TypeAlias = Any
 else:
     Scalar = Float[Array, ""]
+    Vector = Float[Array, " parameters"]
 
-Vector = Float[Array, " parameters"]
 
-
-def _as_float64(value: Any) -> Any:
+def as_float64(value: Any) -> Any:
+    """A number or a sequence as a float64 array: the converter of fields that are not static."""
     # Equinox runs converters while tree operations hold placeholders in the fields.
     if isinstance(value, (int, float, complex, list, tuple)) or hasattr(value, "__array__"):
         return jnp.asarray(value, dtype=jnp.float64)
@@ -65,7 +66,7 @@ def parameter(
     """
     declaration = Declaration(symbol, unit, float(lower), float(upper), float(scale), free, linear)
     extra = {} if default is dataclasses.MISSING else {"default": default}
-    return eqx.field(converter=_as_float64, metadata={"parameter": declaration}, **extra)
+    return eqx.field(converter=as_float64, metadata={"parameter": declaration}, **extra)
 
 
 class Parameter(eqx.Module):
@@ -186,7 +187,7 @@ def set_by_name(model: Any, **values: float) -> Any:
                 f"there is no parameter {name!r} in this model: it has {', '.join(known)}"
             )
     chosen = [known[name] for name in values]
-    flat = jnp.concatenate([jnp.ravel(_as_float64(v)) for v in values.values()])
+    flat = jnp.concatenate([jnp.ravel(as_float64(v)) for v in values.values()])
     return write_values(model, chosen, flat)
 
 

@@ -16,6 +16,7 @@ from .control import Reading, Reference
 from .errors import RecordingError
 from .loop import ClosedLoop, Instant, State, instant, rest
 from .recording import Recording, Recordings
+from .smoothing import Band
 from .stepping import flow
 
 
@@ -42,7 +43,8 @@ class Batch(eqx.Module):
 
     `intervals` has `(recordings, points)` before the axes of each leaf. `at` says which grid
     points are samples, `mask` which of those are there; the initial state is `q0`, `v0`; `q`,
-    `tau` are the measured signals.
+    `tau` are the measured signals. `band` says which part of them the controller lets compare,
+    None for all.
     """
 
     intervals: Interval
@@ -53,6 +55,12 @@ class Batch(eqx.Module):
     time: Float[Array, "recordings samples"]
     q: Float[Array, "recordings samples joints"]
     tau: Float[Array, "recordings samples joints"]
+    band: Band | None = None
+
+    @property
+    def kept(self) -> Bool[Array, "recordings samples"]:
+        """Which samples are there and compared."""
+        return self.mask if self.band is None else self.band.keep
 
 
 class Simulated(eqx.Module):
@@ -190,6 +198,9 @@ def prepare(
     intervals = jax.vmap(jax.vmap(Interval))(*fields)
     on_grid = all(len(grid) == r.samples for r, (grid, _) in zip(recordings, grids, strict=True))
     starts = [(r.q[0], np.zeros(loop.joints)) if at_rest(r) else start_of(r) for r in recordings]
+    band = band_of(loop, recordings)
+    if band is not None:
+        starts = list(np.asarray(intervals.reference[:, 0, :2]))
 
     def stack(pick) -> Array:
         pieces = [pick(k, r) for k, r in enumerate(recordings)]
@@ -207,7 +218,37 @@ def prepare(
         stack(lambda k, r: r.time),
         stack(lambda k, r: r.q),
         stack(lambda k, r: r.tau),
+        band,
     )
+
+
+def band_of(loop: ClosedLoop, recordings: Recordings | Sequence[Recording]) -> Band | None:
+    """The part of the recordings' signals that the controller lets compare; None for all."""
+    cutoffs = [loop.controller.comparable(r) for r in recordings]
+    given = [c for c in cutoffs if c is not None]
+    if len(given) < len(cutoffs):
+        return None
+    return Band.of(list(recordings), given, max(r.samples for r in recordings))
+
+
+def compared(
+    loop: ClosedLoop,
+    recordings: Recordings | Sequence[Recording],
+    signals: Sequence[Float[np.ndarray, "samples_ joints"]],
+) -> list[Float[np.ndarray, "kept_ joints"]]:
+    """What of signals the controller lets compare, `(samples, joints)` for each recording.
+
+    **Arguments:**
+
+    - `signals`: one for each recording, `(samples, joints)`.
+    """
+    band = band_of(loop, recordings)
+    if band is None:
+        return list(signals)
+    longest = band.keep.shape[1]
+    padded = np.stack([np.pad(x, ((0, longest - len(x)), (0, 0))) for x in signals])
+    passed, keep = np.asarray(band(jnp.asarray(padded))), np.asarray(band.keep)
+    return [x[kept] for x, kept in zip(passed, keep, strict=True)]
 
 
 # --- one interval -------------------------------------------------------------------------------

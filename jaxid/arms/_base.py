@@ -40,6 +40,14 @@ class AbstractArm(eqx.Module):
         """Which joints slide, one a joint; the others turn."""
         return (False,) * self.joints
 
+    def link_lengths(self) -> tuple[float, ...]:
+        """Lengths of the links before the last, m; what a payload's torque needs."""
+        return ()
+
+    def gravity(self) -> float:
+        """Gravity in the plane of motion, m/s²."""
+        return 0.0
+
     def units(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Units of torque and of position, one a joint each."""
         slides = self.prismatic()

@@ -26,6 +26,10 @@ class SCARA(AbstractArm):
         """Two."""
         return 2
 
+    def link_lengths(self) -> tuple[float, ...]:
+        """The first link's, m."""
+        return (self.length,)
+
     def mass_matrix(self, q: Float[Array, " joints"]) -> Float[Array, "joints joints"]:
         """Inertia at q, `(2, 2)`, kg·m²."""
         coupling = self.length * (self.MX2 * jnp.cos(q[1]) - self.MY2 * jnp.sin(q[1]))

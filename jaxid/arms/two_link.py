@@ -47,6 +47,14 @@ class TwoLink(AbstractArm):
         assert self.link_length is not None
         return self.link_length * self.p5
 
+    def link_lengths(self) -> tuple[float, ...]:
+        """The first link's as given, or as p3 / p5 has it, m."""
+        return (self.link_length or float(self.coupling / self.p5),)
+
+    def gravity(self) -> float:
+        """As given, m/s²."""
+        return self.g
+
     def mass_matrix(self, q: Float[Array, " joints"]) -> Float[Array, "joints joints"]:
         """Inertia at q, `(2, 2)`, kg·m²."""
         c = self.coupling * jnp.cos(q[1])

@@ -77,6 +77,14 @@ class AbstractController(eqx.Module):
         """What of the command acts now, `(joints,)`; all of it unless the loop has a delay."""
         return command
 
+    def comparable(self, recording: Recording) -> float | None:
+        """Frequency up to which measured and simulated torque may be compared, Hz; None for all.
+
+        Where it is given, both pass the same low-pass first, the ends of a recording do not count,
+        and the loop starts on its reference.
+        """
+        return None
+
     def signals(self, recording: Recording) -> Signals:
         """Reference and known torque, taken from a recording.
 

@@ -5,9 +5,9 @@ import math
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import signal
 
 from ..recording import Recording
+from ..smoothing import even_times, resampled, signal_cutoff, smooth_motion
 from ._base import AbstractController, Reading, Reference, Signals
 
 
@@ -15,18 +15,20 @@ class Tracking(AbstractController):
     """tau = M (a_m + 2 zeta w (v_m - v) + w² (q_m - q)): follows the recorded motion q_m.
 
     Only the tracking has to be alike for the simulated torque to be held against the measured one
-    (Gautier, Janot, Vandanjon 2013). The recorded motion is low-passed, forward and backward, so
-    that a stiff loop is not a noisy one; M is the model's mass matrix.
+    (Gautier, Janot, Vandanjon 2013); M is the model's mass matrix. The recorded motion is
+    low-passed, forward and backward, so that noise is not differentiated into torque. The measured
+    torque holds what that motion cannot explain, so it and the simulated one pass the same filter
+    before they are compared (the parallel filter of Gautier 1997).
 
     **Arguments:**
 
-    - `bandwidth`: of the virtual loop, Hz.
-    - `cutoff`: of the low-pass on the recorded motion, Hz; by default an eighth of the sample
-      rate, at most 20 Hz.
+    - `bandwidth`: of the virtual loop, Hz; above `cutoff`, for what it does not follow is lost.
     - `damping`: ratio of the virtual loop.
+    - `cutoff`: of the low-pass, Hz; by default where the recorded motion's spectrum sinks into
+      noise.
     """
 
-    bandwidth: float = 10.0
+    bandwidth: float = 60.0
     damping: float = 1.0
     cutoff: float | None = eqx.field(static=True, default=None)
 
@@ -42,13 +44,12 @@ class Tracking(AbstractController):
         rate = 2 * self.damping * w * (reference.v - reading.v)
         return mass @ (reference.a + rate + w**2 * (reference.q - reading.q)) + reference.tau
 
+    def comparable(self, recording: Recording) -> float:
+        """The low-pass's cutoff, Hz."""
+        return self.cutoff or signal_cutoff(recording)
+
     def signals(self, recording: Recording) -> Signals:
         """The low-passed recorded motion, `(samples, joints)`."""
-        rate = recording.rate
-        cutoff = self.cutoff or min(20.0, rate / 8)
-        even = np.linspace(recording.time[0], recording.time[-1], recording.samples)
-        q = np.stack([np.interp(even, recording.time, column) for column in recording.q.T], axis=1)
-        sections = signal.butter(4, cutoff, fs=rate, output="sos")
-        smooth = signal.sosfiltfilt(sections, q, axis=0)
-        back = np.stack([np.interp(recording.time, even, column) for column in smooth.T], axis=1)
-        return Signals(back, np.zeros_like(recording.tau))
+        smooth = smooth_motion(recording, self.comparable(recording))
+        q = resampled(even_times(recording), smooth, recording.time)
+        return Signals(q, np.zeros_like(recording.tau))

@@ -5,6 +5,56 @@ from ._base import AbstractTransmission as AbstractTransmission
 from ._base import Motion as Motion
 from ._base import on_joint as on_joint
 from ._base import smooth_sign as smooth_sign
+from ._scene import Scene as Scene
+from .curve import Curve as Curve
+from .disturbance import PeriodicDisturbance as PeriodicDisturbance
+from .drive import ActuatorLag as ActuatorLag
+from .drive import DriveGain as DriveGain
+from .drive import TimeDelay as TimeDelay
+from .drive import TorqueSaturation as TorqueSaturation
+from .friction import AsymmetricFriction as AsymmetricFriction
 from .friction import Coulomb as Coulomb
+from .friction import QuadraticDrag as QuadraticDrag
+from .friction import Stribeck as Stribeck
 from .friction import Viscous as Viscous
-from .offset import TorqueOffset as TorqueOffset
+from .friction_varying import Hysteresis as Hysteresis
+from .friction_varying import LoadDependentFriction as LoadDependentFriction
+from .friction_varying import LuGre as LuGre
+from .friction_varying import PositionDependentFriction as PositionDependentFriction
+from .friction_varying import ThermalDrift as ThermalDrift
+from .inertia import Payload as Payload
+from .inertia import RotorInertia as RotorInertia
+from .position import EndStop as EndStop
+from .position import Gravity as Gravity
+from .position import Spring as Spring
+from .position import TorqueOffset as TorqueOffset
+from .position import TorqueRipple as TorqueRipple
+from .sensor import EncoderEccentricity as EncoderEccentricity
+from .transmission import Backlash as Backlash
+from .transmission import JointElasticity as JointElasticity
+
+catalogue: tuple[type[AbstractEffect], ...] = (
+    Stribeck,
+    AsymmetricFriction,
+    QuadraticDrag,
+    LoadDependentFriction,
+    PositionDependentFriction,
+    Hysteresis,
+    LuGre,
+    JointElasticity,
+    Backlash,
+    TorqueRipple,
+    TorqueOffset,
+    DriveGain,
+    ActuatorLag,
+    TimeDelay,
+    TorqueSaturation,
+    Gravity,
+    Spring,
+    Payload,
+    RotorInertia,
+    ThermalDrift,
+    PeriodicDisturbance,
+    EndStop,
+    EncoderEccentricity,
+)

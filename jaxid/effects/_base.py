@@ -1,21 +1,25 @@
 """What an effect may do, and where on the signal's way it may do it."""
 
+import dataclasses
 import re
-from typing import ClassVar
+from collections.abc import Iterable
+from typing import ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..parameters import Scalar
+from ._scene import Scene
 
 
 class Motion(eqx.Module):
     """What an effect sees of the arm at one instant; every vector is `(joints,)`.
 
     `t` in s; `q`, `v`, `a` in rad or m and their derivatives; `tau` what the drives deliver, N·m
-    or N. `a` is zero where an effect is not `inertial`. `state` is the effect's own.
-    `label` tells recordings apart (`recording_label`).
+    or N. `a` is zero where an effect neither is `inertial` nor `needs_acceleration`. For an effect
+    that is `loaded`, `tau` is what the other effects leave for the links. `state` is the effect's
+    own. `label` tells recordings apart (`recording_label`).
     """
 
     t: Float[Array, ""]
@@ -33,16 +37,33 @@ class AbstractEffect(eqx.Module):
     `command` acts on the torque on its way through the drive, `torque` at the joint, `read` on
     what the sensor reports. What lies between drive and link is an `AbstractTransmission`.
 
-    Class attributes: `inertial` says that `torque` depends on acceleration (it must then be
-    affine in it).
+    Class attributes, all False by default:
+
+    - `inertial`: `torque` depends on acceleration and is affine in it.
+    - `needs_acceleration`: `torque` depends on acceleration in another way; it is given the
+      acceleration that there would be without it.
+    - `loaded`: `torque` depends on the torque that reaches the link.
     """
 
     inertial: ClassVar[bool] = False
+    needs_acceleration: ClassVar[bool] = False
+    loaded: ClassVar[bool] = False
 
     @classmethod
     def effect_name(cls) -> str:
         """Its name in tables: the class's in lower case with underscores."""
         return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable[Self]:
+        """Instances to screen, at zero amplitude: every joint, and a grid of shapes if it has any.
+
+        Of effects in whose parameters nothing is linear: instances at a small finite setting.
+        """
+        fields = {field.name for field in dataclasses.fields(cls)}
+        if "joint" not in fields:
+            return [cls()]
+        return [cls(joint=j) for j in scene.joints]  # type: ignore[call-arg]
 
     def initial_state(self) -> Float[Array, " states"]:
         """Its own states at rest; none by default."""
@@ -66,7 +87,7 @@ class AbstractEffect(eqx.Module):
 
 
 class AbstractTransmission(AbstractEffect):
-    """Something that gives way between drive and link of one joint.
+    """Something that gives way between drive and link of one joint (Spong 1987).
 
     The drive keeps the inertia `rotor`; the sensor and the friction sit on the drive. The twist
     (link minus drive) and its rate are the effect's states.
@@ -78,6 +99,10 @@ class AbstractTransmission(AbstractEffect):
     def initial_state(self) -> Float[Array, " states"]:
         """No twist, at rest."""
         return jnp.zeros(2)
+
+    def present(self) -> Bool[Array, ""]:
+        """Whether it gives way at all; where not, drive and link move as one."""
+        return jnp.asarray(True)
 
     def through(self, twist: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
         """Torque that the drive passes on to the link at this twist (rad) and rate (rad/s)."""

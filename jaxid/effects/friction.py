@@ -1,10 +1,23 @@
-"""Friction that every model starts with: viscous and Coulomb."""
+"""Friction that depends on speed alone."""
+
+from collections.abc import Iterable
+from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..parameters import Scalar, parameter
 from ._base import AbstractEffect, Motion, on_joint, smooth_sign
+from ._scene import Scene
+
+
+def sharpness() -> Any:
+    """The field for the sharpness of a smoothed sign, 100 s/rad as in Brunot et al. 2016."""
+    return parameter(
+        100.0, symbol="gamma", unit="s/rad", lower=0.0, scale=100.0, free=False, linear=False
+    )
 
 
 class Viscous(AbstractEffect):
@@ -19,15 +32,75 @@ class Viscous(AbstractEffect):
 
 
 class Coulomb(AbstractEffect):
-    """Dry friction, smoothed: Fc · 2/pi · arctan(gamma v)  (Brunot et al. 2016)."""
+    """Dry friction, smoothed: Fc sigma(v), sigma = 2/pi arctan(gamma v) (Brunot et al. 2016)."""
 
     joint: int = eqx.field(static=True)
     level: Scalar = parameter(0.0, symbol="Fc", unit="N·m", lower=0.0, scale=0.1)
-    gamma: Scalar = parameter(
-        100.0, symbol="gamma", unit="s/rad", lower=0.0, scale=100.0, free=False, linear=False
-    )
+    gamma: Scalar = sharpness()
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """Fc sigma(v) on the joint, `(joints,)`."""
         sign = smooth_sign(motion.v[self.joint - 1], self.gamma)
         return on_joint(self.joint, self.level * sign, motion)
+
+
+class Stribeck(AbstractEffect):
+    """Friction that falls with speed: Fs exp(-(v/vs)²) sigma(v) (Armstrong-Hélouvry 1991)."""
+
+    joint: int = eqx.field(static=True)
+    level: Scalar = parameter(0.0, symbol="Fs", unit="N·m", lower=0.0, scale=0.1)
+    velocity: Scalar = parameter(
+        0.1, symbol="vs", unit="rad/s", lower=1e-4, scale=0.1, linear=False
+    )
+    gamma: Scalar = sharpness()
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["Stribeck"]:
+        """Velocities from a fiftieth to a half of the highest speed."""
+        shares = np.geomspace(0.02, 0.5, 7)
+        return [
+            cls(joint=j, velocity=share * scene.speed[j - 1], gamma=scene.sharpness(j))
+            for j in scene.joints
+            for share in shares
+        ]
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """Fs exp(-(v/vs)²) sigma(v) on the joint, `(joints,)`."""
+        v = motion.v[self.joint - 1]
+        fall = jnp.exp(-((v / self.velocity) ** 2))
+        return on_joint(self.joint, self.level * fall * smooth_sign(v, self.gamma), motion)
+
+
+class AsymmetricFriction(AbstractEffect):
+    """Friction that differs by direction: (dFv v + dFc sigma(v)) sigma(v) (Janot et al. 2017).
+
+    Forward it adds dFv to viscous and dFc to Coulomb friction, backward it takes them off.
+    """
+
+    joint: int = eqx.field(static=True)
+    viscous: Scalar = parameter(0.0, symbol="dFv", unit="N·m·s/rad", scale=0.05)
+    coulomb: Scalar = parameter(0.0, symbol="dFc", unit="N·m", scale=0.1)
+    gamma: Scalar = sharpness()
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["AsymmetricFriction"]:
+        """Every joint."""
+        return [cls(joint=j, gamma=scene.sharpness(j)) for j in scene.joints]
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """(dFv v + dFc sigma(v)) sigma(v) on the joint, `(joints,)`."""
+        v = motion.v[self.joint - 1]
+        sign = smooth_sign(v, self.gamma)
+        return on_joint(self.joint, (self.viscous * v + self.coulomb * sign) * sign, motion)
+
+
+class QuadraticDrag(AbstractEffect):
+    """Drag that grows with the square of speed: Fq v |v| (fluid, fan-cooled motors)."""
+
+    joint: int = eqx.field(static=True)
+    coefficient: Scalar = parameter(0.0, symbol="Fq", unit="N·m·s²/rad²", lower=0.0, scale=0.01)
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """Fq v |v| on the joint, `(joints,)`."""
+        v = motion.v[self.joint - 1]
+        return on_joint(self.joint, self.coefficient * v * jnp.abs(v), motion)

@@ -62,6 +62,8 @@ def sensitivity(
     scale = weights * batch.mask[..., None]
     residual = (measured - seen) * scale
     slopes = -slopes * scale[..., None]
+    if batch.band is not None:
+        residual, slopes = batch.band(residual), batch.band(slopes)
     return Sensitivity(residual, slopes[..., :p], slopes[..., p:] if free_start else None)
 
 

@@ -15,6 +15,7 @@ from ..loop import ClosedLoop, inverse
 from ..parameters import Parameter, read_values, write_values
 from ..recording import Recording
 from ..simulate import Simulated, recording_label
+from ..smoothing import even_times, resampled, signal_cutoff, smooth_motion
 
 
 class Filtering(eqx.Module):
@@ -22,8 +23,8 @@ class Filtering(eqx.Module):
 
     **Arguments:**
 
-    - `cutoff`: of the low-pass on position, applied forward and backward, Hz; by default a tenth
-      of the sample rate.
+    - `cutoff`: of the low-pass on position, applied forward and backward, Hz; by default where
+      the recorded motion's spectrum sinks into noise.
     - `rate`: sample rate after decimation, Hz; by default the cutoff.
     - `order`: of the Butterworth filter.
     - `trim`: dropped at both ends, s; by default five samples after decimation.
@@ -39,7 +40,7 @@ class Filtering(eqx.Module):
 
         **Raises:** `FitError` for a cutoff above the Nyquist rate, or too few samples.
         """
-        cutoff = self.cutoff or recording.rate / 10
+        cutoff = self.cutoff or signal_cutoff(recording)
         if cutoff >= recording.rate / 2:
             raise FitError(
                 f"a cutoff of {cutoff:g} Hz is above half the sample rate of {recording.name} "
@@ -61,19 +62,13 @@ def filtered(recording: Recording, filtering: Filtering) -> Simulated:
     Uneven samples are first laid on an even grid.
     """
     cutoff, _, _ = filtering.settled(recording)
-    n = recording.samples
-    time = np.linspace(recording.time[0], recording.time[-1], n)
-
-    def even(x: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(time, recording.time, column) for column in x.T], axis=1)
-
-    sections = signal.butter(filtering.order, cutoff, fs=recording.rate, output="sos")
-    q = signal.sosfiltfilt(sections, even(recording.q), axis=0)
+    time = even_times(recording)
+    q = smooth_motion(recording, cutoff, filtering.order)
     dt = time[1] - time[0]
     v = np.gradient(q, dt, axis=0)
     a = np.gradient(v, dt, axis=0)
-    tau = even(recording.tau)
-    return Simulated(time, q, v, a, tau, tau, np.zeros((n, 0)))  # type: ignore[arg-type]
+    tau = resampled(recording.time, recording.tau, time)
+    return Simulated(time, q, v, a, tau, tau, np.zeros((recording.samples, 0)))
 
 
 def linear_parameters(loop: ClosedLoop) -> tuple[Parameter, ...]:

@@ -21,6 +21,7 @@ from ..recording import Recording, Recordings
 from ..simulate import (
     Batch,
     at_rest,
+    compared,
     prepare,
     set_substeps,
     simulate,
@@ -123,11 +124,11 @@ def _linear_values(fit: Fit) -> Float[np.ndarray, " parameters"]:
 def _simulated_error(loop: ClosedLoop, recordings: Recordings) -> float:
     """Sum over joints of the relative torque error of a simulation; infinite if it fails."""
     runs = simulate(loop, recordings)
-    error = np.zeros(loop.joints)
-    size = np.zeros(loop.joints)
-    for run, recording in zip(runs, recordings, strict=True):
-        error += np.sum((recording.tau - run.tau) ** 2, axis=0)
-        size += np.sum(recording.tau**2, axis=0)
+    measured = compared(loop, recordings, [r.tau for r in recordings])
+    simulated = compared(loop, recordings, [np.asarray(run.tau) for run in runs])
+    pairs = list(zip(measured, simulated, strict=True))
+    error = sum(np.sum((m - s) ** 2, axis=0) for m, s in pairs)
+    size = sum(np.sum(m**2, axis=0) for m, _ in pairs)
     total = float(np.sum(error / size))
     return total if np.isfinite(total) else np.inf
 
@@ -171,8 +172,10 @@ def _signals(method: OEM, loop: ClosedLoop) -> tuple[str, ...]:
     return {"torque": ("tau",), "position": ("q",), "both": ("tau", "q")}[output]
 
 
-def _free_starts(method: OEM, pieces: Sequence[Recording]) -> Float[np.ndarray, " recordings"]:
-    if method.initial == "rest":
+def _free_starts(
+    method: OEM, pieces: Sequence[Recording], batch: Batch
+) -> Float[np.ndarray, " recordings"]:
+    if method.initial == "rest" or (method.initial == "auto" and batch.band is not None):
         return np.zeros(len(pieces))
     if method.initial == "free" or method.window is not None:
         return np.ones(len(pieces))
@@ -198,7 +201,7 @@ def _converge(
     pieces = pieces_of(recordings, method.window)
     signals = _signals(method, loop)
     batch = prepare(loop, pieces)
-    free = _free_starts(method, pieces)
+    free = _free_starts(method, pieces, batch)
     weights = jnp.asarray(_first_weights(loop, pieces, signals))
     bounds = Bounds.of(loop.free_parameters)
     total, minimum = 0, None
@@ -239,7 +242,7 @@ def _new_weights(
     found: Sensitivity, batch: Batch, weights: Float[Array, " outputs"]
 ) -> Float[Array, " outputs"]:
     """One over each output's residual deviation; recorded noise-free outputs keep a floor."""
-    count = jnp.sum(batch.mask)
+    count = jnp.sum(batch.kept)
     spread = jnp.sqrt(jnp.sum(found.residual**2, axis=(0, 1)) / count) / weights
     floor = 1e-9 / weights
     return 1 / jnp.maximum(spread, floor)
@@ -264,7 +267,7 @@ def _too_coarse(done: _Done, recordings: Recordings) -> int | None:
 
 
 def _report(method: OEM, done: _Done, recordings: Recordings, seconds: float) -> Fit:
-    found, mask = done.minimum.found, np.asarray(done.batch.mask)
+    found, mask = done.minimum.found, np.asarray(done.batch.kept)
     names = done.loop.names
     residuals = [np.asarray(found.residual)[k][mask[k]] for k in range(len(done.pieces))]
     jacobians = [np.asarray(found.jacobian)[k][mask[k]] for k in range(len(done.pieces))]
@@ -278,6 +281,7 @@ def _report(method: OEM, done: _Done, recordings: Recordings, seconds: float) ->
     unweighted = [r / np.asarray(done.weights) for r in residuals]
     n = done.loop.joints
     measured = [getattr(piece, done.signals[0]) for piece in done.pieces]
+    measured = compared(done.loop, done.pieces, measured)
     errors = [r[:, :n] for r in unweighted]
     measured, errors = _rejoin(recordings, done.pieces, measured, errors)
     notes = _at_bounds(done.loop)

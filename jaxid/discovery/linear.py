@@ -1,0 +1,138 @@
+"""The loop along a run as a linear time-varying system: linearise once, force many."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..effects import Motion
+from ..loop import ClosedLoop
+from ..simulate import SIGNALS, Batch, Interval, advance, initial, run
+
+
+class Linearised(eqx.Module):
+    """Exact derivatives of every interval along the runs of a batch.
+
+    With x' = A x + B u and y = C x + D u, where u holds the free parameters, then torque on the
+    joints at both ends of an interval, then what is added to the sensors at both ends. Each leaf
+    has `(recordings, points)` first. `motion` is the nominal one, `seen` the signals of `SIGNALS`.
+    """
+
+    A: Float[Array, "recordings points states states"]
+    B: Float[Array, "recordings points states inputs"]
+    C: Float[Array, "recordings points outputs states"]
+    D: Float[Array, "recordings points outputs inputs"]
+    start: Float[Array, "recordings states starts"]
+    motion: Motion
+    seen: Float[Array, "recordings points 5 joints"]
+
+
+@eqx.filter_jit
+def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
+    """Runs the loop and linearises every interval.
+
+    **Arguments:**
+
+    - `output`: which of `SIGNALS` is compared.
+    """
+    n, theta, row = loop.joints, loop.theta, SIGNALS.index(output)
+    p = theta.shape[0]
+    ends = jnp.zeros((4, n))
+
+    def one(u, interval, x):
+        push, noise = u[p:].reshape(2, 2, n)
+        forced = dataclasses.replace(interval, push=push, noise=noise)
+        after, seen = advance(loop.with_theta(u[:p]), forced, x)
+        return jnp.concatenate([after, seen[row]])
+
+    def at(interval, x):
+        m = x.shape[0]
+        u = jnp.concatenate([x, theta, ends.ravel()])
+        slope = jax.jacfwd(lambda w: one(w[m:], interval, w[:m]))(u)
+        return slope[:m, :m], slope[:m, m:], slope[m:, :m], slope[m:, m:]
+
+    def whole(intervals: Interval, q0, v0):
+        x0 = initial(loop, q0, v0)
+        states, seen = run(loop, intervals, x0)
+        a, b, c, d = jax.vmap(at)(intervals, states)
+        start = jax.jacfwd(lambda z: initial(loop, z[:n], z[n:]))(jnp.concatenate([q0, v0]))
+        still = jnp.zeros((states.shape[0], 0))
+        motion = jax.vmap(Motion)(
+            intervals.t0,
+            states[:, :n],
+            states[:, n : 2 * n],
+            seen[:, 3],
+            seen[:, 4],
+            still,
+            intervals.label,
+        )
+        return a, b, c, d, start, motion, seen
+
+    return Linearised(*jax.vmap(whole)(batch.intervals, batch.q0, batch.v0))
+
+
+@eqx.filter_jit
+def base_columns(
+    linear: Linearised, parameters: int, free_start: bool
+) -> Float[Array, "recordings points outputs columns"]:
+    """What the loop's own parameters, and initial states where free, do to the output.
+
+    Initial states have one set of columns, to be taken for each recording on its own.
+    """
+
+    def one(a, b, c, d, start):
+        first = jnp.zeros((a.shape[-1], parameters))
+        if free_start:
+            first = jnp.concatenate([first, start], axis=1)
+        extra = first.shape[1] - parameters
+
+        def body(s, step):
+            a, b = step
+            return a @ s + jnp.pad(b, ((0, 0), (0, extra))), s
+
+        _, history = jax.lax.scan(body, first, (a, b[..., :parameters]))
+        direct = jnp.pad(d[..., :parameters], ((0, 0), (0, 0), (0, extra)))
+        return c @ history + direct
+
+    return jax.vmap(one)(linear.A, linear.B, linear.C, linear.D, linear.start)
+
+
+@eqx.filter_jit
+def respond(
+    linear: Linearised,
+    parameters: int,
+    push: Float[Array, "recordings points joints columns"],
+    noise: Float[Array, "recordings points joints columns"] | None = None,
+) -> Float[Array, "recordings points outputs columns"]:
+    """What torque on the joints, and errors of the sensors, do to the output through the loop.
+
+    **Arguments:**
+
+    - `parameters`: how many inputs of `linear` are parameters.
+    - `push`: torque on the joints, one column a hypothesis, N·m or N.
+    - `noise`: what is added to the sensors' positions, rad or m.
+    """
+    n = push.shape[2]
+
+    def pairs(values):
+        return jnp.concatenate([values, jnp.concatenate([values[1:], values[-1:]])], axis=1)
+
+    def one(a, b, c, d, push, noise):
+        first, second = slice(parameters, parameters + 2 * n), slice(parameters + 2 * n, None)
+        inputs, b_in, d_in = pairs(push), b[..., first], d[..., first]
+        forced, direct = b_in @ inputs, d_in @ inputs
+        if noise is not None:
+            wrong = pairs(noise)
+            forced, direct = forced + b[..., second] @ wrong, direct + d[..., second] @ wrong
+
+        def body(s, step):
+            a, f = step
+            return a @ s + f, s
+
+        zero = jnp.zeros((a.shape[-1], push.shape[-1]))
+        _, history = jax.lax.scan(body, zero, (a, forced))
+        return c @ history + direct
+
+    return jax.vmap(one)(linear.A, linear.B, linear.C, linear.D, push, noise)

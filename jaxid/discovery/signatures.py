@@ -1,0 +1,292 @@
+"""Signatures: what the closed loop would have shown, had an effect been there."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..effects import AbstractEffect, AbstractTransmission, Coulomb, Curve, Motion, Scene
+from ..effects.curve import curve_over
+from ..errors import ModelError
+from ..loop import ClosedLoop, effect_load
+from ..parameters import Parameter, list_parameters, read_values, write_values
+from ..recording import Recordings
+from ..simulate import Batch, initial, run
+from .linear import Linearised, respond
+
+
+class Hypothesis(eqx.Module):
+    """One effect at one setting, with its columns in the table of signatures.
+
+    `tests` counts how many settings it stands for, where it was picked from many by the data.
+    """
+
+    effect: AbstractEffect
+    columns: tuple[int, ...] = eqx.field(static=True)
+    tests: float = eqx.field(static=True, default=1.0)
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.effect.effect_name()
+
+    @property
+    def joint(self) -> int | None:
+        """Its joint, counted from 1; None for effects of the whole arm."""
+        return getattr(self.effect, "joint", None)
+
+
+def amplitudes(effect: AbstractEffect) -> tuple[Parameter, ...]:
+    """The parameters in which the effect is linear."""
+    return tuple(p for p in list_parameters(effect) if p.declaration.free and p.declaration.linear)
+
+
+def is_curve(effect: AbstractEffect) -> bool:
+    """Whether an effect is the free-form hypothesis."""
+    return isinstance(effect, Curve)
+
+
+# --- which hypotheses --------------------------------------------------------------------------
+
+
+def survey(
+    loop: ClosedLoop,
+    recordings: Recordings,
+    motion: Motion,
+    tones: Sequence[Sequence[float]],
+) -> Scene:
+    """What screening knows of the recordings and the nominal motion."""
+    q = np.asarray(motion.q).reshape(-1, loop.joints)
+    mass = np.asarray(jax.vmap(loop.arm.mass_matrix)(jnp.asarray(q[:: max(1, len(q) // 64)])))
+    sharp = {e.joint: float(e.gamma) for e in loop.effects if isinstance(e, Coulomb)}
+    return Scene(
+        q.min(axis=0),
+        q.max(axis=0),
+        np.abs(np.asarray(motion.v)).reshape(-1, loop.joints).max(axis=0),
+        np.abs(np.asarray(motion.tau)).reshape(-1, loop.joints).max(axis=0),
+        np.einsum("kjj->j", mass) / len(mass),
+        np.array([sharp.get(j, 100.0) for j in range(1, loop.joints + 1)]),
+        float(np.median([r.period for r in recordings])),
+        float(max(r.duration for r in recordings)),
+        tuple(recordings.names),
+        tuple(tuple(float(f) for f in row) for row in tones),
+        tuple(float(x) for x in loop.arm.link_lengths()),
+        float(loop.arm.gravity()),
+        tuple(loop.arm.prismatic()),
+    )
+
+
+def curves(scene: Scene, motion: Motion, knots: int = 12) -> list[Curve]:
+    """A curve over every coordinate, plain and with the sign of velocity, on every joint."""
+    over: list[tuple[Any, int, np.ndarray]] = [("t", 1, np.asarray(motion.t).ravel())]
+    for name in ("q", "v", "a", "tau"):
+        values = np.asarray(getattr(motion, name)).reshape(-1, len(scene.q_low))
+        over += [(name, j, values[:, j - 1]) for j in scene.joints]
+    made = []
+    for coordinate, of, values in over:
+        low, high = curve_over(values)
+        for joint in scene.joints:
+            for signed in (False, True):
+                made.append(
+                    Curve(
+                        joint=joint,
+                        coordinate=coordinate,
+                        of=of,
+                        low=low,
+                        high=high,
+                        signed=signed,
+                        coefficients=jnp.zeros(knots),
+                        gamma=scene.sharpness(joint),
+                    )
+                )
+    return made
+
+
+def candidates(
+    catalogue: Sequence[Any], scene: Scene, trials: float
+) -> list[tuple[AbstractEffect, float]]:
+    """Every instance that a catalogue proposes, with how many settings it stands for.
+
+    **Arguments:**
+
+    - `catalogue`: effect classes, effects, or functions from a `Scene` to effects.
+    - `trials`: how many frequencies the tones of the scene were picked from.
+
+    **Raises:** `ModelError` for an entry that is none of these.
+    """
+    made: list[AbstractEffect] = []
+    for entry in catalogue:
+        if isinstance(entry, AbstractEffect):
+            made.append(entry)
+        elif isinstance(entry, type) and issubclass(entry, AbstractEffect):
+            made.extend(entry.screened(scene))
+        elif callable(entry):
+            given: Any = entry(scene)
+            made.extend([given] if isinstance(given, AbstractEffect) else list(given))
+        else:
+            raise ModelError(
+                f"{entry!r} cannot be screened: a catalogue holds effect classes, effects, or "
+                "functions from a scene to effects"
+            )
+    picked = max(1, sum(len(row) for row in scene.tones))
+    return [
+        (e, trials / picked if e.effect_name() == "periodic_disturbance" else 1.0) for e in made
+    ]
+
+
+# --- their signatures --------------------------------------------------------------------------
+
+
+def _settled_states(effect: AbstractEffect, motion: Motion) -> Float[Array, "points states"]:
+    """The effect's own states along a motion, by an exponential step for each interval.
+
+    States relax with rates that friction and lags make stiff; the step is exact where the rate is
+    linear in its state and the motion a line.
+    """
+    start = effect.initial_state()
+    if start.shape[0] == 0:
+        return jnp.zeros((motion.t.shape[0], 0))
+
+    def body(x, pair):
+        now, then = pair
+        h = then.t - now.t
+        middle = jax.tree.map(lambda a, b: 0.5 * (a + b), now, eqx.tree_at(_label, then, now.label))
+
+        def rate(state):
+            return effect.derivative(eqx.tree_at(lambda m: m.state, middle, state))
+
+        slope = h * jnp.diagonal(jax.jacfwd(rate)(x))
+        small = jnp.abs(slope) < 1e-6
+        gain = jnp.where(small, 1.0, jnp.expm1(slope) / jnp.where(small, 1.0, slope))
+        return x + h * gain * rate(x), x
+
+    following = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), motion)
+    return jax.lax.scan(body, start, (motion, following))[1]
+
+
+def _label(motion: Motion) -> Array:
+    return motion.label
+
+
+def _forces(
+    effect: AbstractEffect, motion: Motion, left: Float[Array, "points joints"]
+) -> tuple[Float[Array, "points joints columns"], Float[Array, "points joints columns"]]:
+    """What the effect adds to joint torque and sensor reading along one run, by amplitude."""
+    linear = amplitudes(effect)
+    states = _settled_states(effect, motion)
+
+    def along(values: Float[Array, " columns"], absent: bool = False):
+        here = write_values(effect, linear, values) if linear else effect
+
+        def one(at: Motion, state, rest):
+            at = eqx.tree_at(lambda m: m.state, at, state)
+            loaded = eqx.tree_at(lambda m: m.tau, at, rest) if effect.loaded else at
+            return here.command(at) - at.tau - here.torque(loaded), here.read(at.q) - at.q
+
+        return jax.vmap(one)(motion, states, left)
+
+    if linear:
+        return jax.jacfwd(along)(read_values(effect, linear))
+    push, noise = along(jnp.zeros(0))
+    return push[..., None], noise[..., None]
+
+
+Group = tuple[AbstractEffect, int]
+
+
+@eqx.filter_jit
+def _all_forces(
+    loop: ClosedLoop, groups: list[AbstractEffect], motion: Motion
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Forces of all hypotheses: one trace for each structure, `vmap` over its settings."""
+
+    def of_run(run: Motion):
+        def remaining(at: Motion):
+            states = tuple(effect.initial_state() for effect in loop.effects)
+            return at.tau - effect_load(loop, at, states)
+
+        left = jax.vmap(remaining)(run)
+        pushes, noises = [], []
+        for stacked in groups:
+            push, noise = eqx.filter_vmap(
+                lambda effect: _forces(effect, run, left), in_axes=eqx.if_array(0)
+            )(stacked)
+            # (settings, points, joints, columns) to (points, joints, settings · columns)
+            shape = (*push.shape[1:3], -1)
+            pushes.append(jnp.moveaxis(push, 0, 2).reshape(shape))
+            noises.append(jnp.moveaxis(noise, 0, 2).reshape(shape))
+        return jnp.concatenate(pushes, axis=-1), jnp.concatenate(noises, axis=-1)
+
+    return jax.vmap(of_run)(motion)
+
+
+def _grouped(effects: Sequence[AbstractEffect]) -> list[tuple[AbstractEffect, list[int]]]:
+    """Effects of equal structure stacked, with their places."""
+    groups: dict[Any, list[int]] = {}
+    for k, effect in enumerate(effects):
+        leaves, structure = jax.tree.flatten(effect)
+        key = (structure, tuple(np.shape(leaf) for leaf in leaves))
+        groups.setdefault(key, []).append(k)
+    return [
+        (jax.tree.map(lambda *leaves: jnp.stack(leaves), *(effects[k] for k in places)), places)
+        for places in groups.values()
+    ]
+
+
+def _difference(
+    loop: ClosedLoop, effect: AbstractEffect, batch: Batch, row: int
+) -> Float[Array, "recordings points joints"]:
+    return _finite(loop.add(effect), batch, row)
+
+
+@eqx.filter_jit
+def _finite(loop: ClosedLoop, batch: Batch, row: int) -> Float[Array, "recordings points joints"]:
+    def one(intervals, q0, v0):
+        return run(loop, intervals, initial(loop, q0, v0))[1][:, row]
+
+    return jax.vmap(one)(batch.intervals, batch.q0, batch.v0)
+
+
+def signatures(
+    loop: ClosedLoop,
+    batch: Batch,
+    linear: Linearised,
+    proposed: Sequence[tuple[AbstractEffect, float]],
+    row: int,
+    say: Callable[[str], None],
+) -> tuple[list[Hypothesis], Float[np.ndarray, "recordings points outputs columns"]]:
+    """Hypotheses and the table of their signatures, one column an amplitude.
+
+    Effects that act at the joint, on the command or on the sensor: the response of the linear
+    system. Transmissions: the difference of a simulation with a small finite one.
+    """
+    direct = [k for k, (e, _) in enumerate(proposed) if not isinstance(e, AbstractTransmission)]
+    made: dict[int, Hypothesis] = {}
+    blocks, at = [], 0
+    groups = _grouped([proposed[k][0] for k in direct])
+    if groups:
+        say(f"{len(direct)} signatures by linear response")
+        push, noise = _all_forces(loop, [stacked for stacked, _ in groups], linear.motion)
+        wrong = noise if bool(jnp.any(noise != 0)) else None
+        blocks.append(np.asarray(respond(linear, loop.theta.shape[0], push, wrong)))
+        for _, places in groups:
+            for place in places:
+                effect, tests = proposed[direct[place]]
+                width = max(1, sum(p.size for p in amplitudes(effect)))
+                made[direct[place]] = Hypothesis(effect, tuple(range(at, at + width)), tests)
+                at += width
+    for k, (effect, tests) in enumerate(proposed):
+        if k in made:
+            continue
+        say(f"{effect.effect_name()} by simulation")
+        moved = np.asarray(_difference(loop, effect, batch, row))
+        column = moved - np.asarray(linear.seen[:, :, row])
+        if np.isfinite(column).all():
+            blocks.append(column[..., None])
+            made[k] = Hypothesis(effect, (at,), tests)
+            at += 1
+    return [made[k] for k in sorted(made)], np.concatenate(blocks, axis=-1)

@@ -1,0 +1,44 @@
+"""What screening knows of the recordings, so that an effect can propose settings worth trying."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+
+class Scene(eqx.Module):
+    """Ranges of the recorded motion, one value a joint, in SI units.
+
+    - `q_low`, `q_high`: range of position. `speed`, `torque`: largest magnitudes.
+    - `inertia`: diagonal of the mass matrix, averaged. `gamma`: sharpness of the Coulomb friction.
+    - `period`, `duration`: of the recordings, s. `recordings`: their names.
+    - `tones`: frequencies that stand out of the residual's spectrum, Hz.
+    - `lengths`: of the links before the last, m; `g`: gravity in their plane, m/s².
+    - `slides`: whether a joint slides.
+    """
+
+    q_low: Float[np.ndarray, " joints"]
+    q_high: Float[np.ndarray, " joints"]
+    speed: Float[np.ndarray, " joints"]
+    torque: Float[np.ndarray, " joints"]
+    inertia: Float[np.ndarray, " joints"]
+    gamma: Float[np.ndarray, " joints"]
+    period: float
+    duration: float
+    recordings: tuple[str, ...]
+    tones: tuple[tuple[float, ...], ...]
+    lengths: tuple[float, ...]
+    g: float
+    slides: tuple[bool, ...]
+
+    @property
+    def joints(self) -> range:
+        """Joints, counted from 1."""
+        return range(1, len(self.q_low) + 1)
+
+    def travel(self, joint: int) -> float:
+        """Range of a joint's position, rad or m."""
+        return float(self.q_high[joint - 1] - self.q_low[joint - 1])
+
+    def sharpness(self, joint: int) -> float:
+        """Sharpness of the sign function on a joint, s/rad or s/m."""
+        return float(self.gamma[joint - 1])

@@ -1,0 +1,73 @@
+"""The hypothesis that assumes nothing: a free-form spline of one coordinate."""
+
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..parameters import Scalar, as_float64, parameter
+from ._base import AbstractEffect, Motion, on_joint, smooth_sign
+from .friction import sharpness
+
+Coordinate = Literal["q", "v", "a", "tau", "t"]
+
+
+class Curve(AbstractEffect):
+    """A torque on one joint that is a smooth function of one coordinate, of any joint.
+
+    A cubic B-spline on even knots between `low` and `high`, constant beyond them.
+
+    - `joint`: on which the torque acts. `coordinate`: position `"q"`, velocity `"v"`,
+      acceleration `"a"`, torque `"tau"` (of `of`) or time `"t"`.
+    - `signed`: times the sign of this joint's velocity, as friction.
+    """
+
+    joint: int = eqx.field(static=True)
+    coordinate: Coordinate = eqx.field(static=True)
+    of: int = eqx.field(static=True, default=1)
+    low: Scalar = eqx.field(converter=as_float64, default=-1.0)
+    high: Scalar = eqx.field(converter=as_float64, default=1.0)
+    signed: bool = eqx.field(static=True, default=False)
+    coefficients: Float[Array, " knots"] = parameter((0.0,) * 12, symbol="s", unit="N·m", scale=0.1)
+    gamma: Scalar = sharpness()
+    needs_acceleration = True
+
+    @property
+    def label(self) -> str:
+        """The coordinate with its joint, as `v2`; time alone."""
+        return "t" if self.coordinate == "t" else f"{self.coordinate}{self.of}"
+
+    def basis(self, x: Float[Array, ""]) -> Float[Array, " knots"]:
+        """The value of each B-spline at a coordinate, `(knots,)`; they sum to one."""
+        n = self.coefficients.shape[0]
+        place = jnp.clip((x - self.low) / (self.high - self.low), 0.0, 1.0) * (n - 3)
+        return cubic_bump(place - (jnp.arange(n) - 1.0))
+
+    def value(self, x: Float[Array, ""]) -> Float[Array, ""]:
+        """The curve at a coordinate, N·m or N."""
+        return self.basis(x) @ self.coefficients
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """The curve's torque on its joint, `(joints,)`."""
+        x = motion.t if self.coordinate == "t" else getattr(motion, self.coordinate)[self.of - 1]
+        value = self.value(x)
+        if self.signed:
+            value = value * smooth_sign(motion.v[self.joint - 1], self.gamma)
+        return on_joint(self.joint, value, motion)
+
+
+def cubic_bump(d: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The cubic B-spline of unit knots centred at zero (de Boor 1978)."""
+    d = jnp.abs(d)
+    near = 2 / 3 - d**2 + d**3 / 2
+    far = (2 - d) ** 3 / 6
+    return jnp.where(d < 1, near, jnp.where(d < 2, far, 0.0))
+
+
+def curve_over(values: Float[np.ndarray, " samples"]) -> tuple[float, float]:
+    """Ends of a curve over recorded values of a coordinate: all but a thousandth at each end."""
+    low, high = np.quantile(values, [0.001, 0.999])
+    width = max(float(high - low), 1e-9)
+    return float(low) - 1e-3 * width, float(high) + 1e-3 * width

@@ -1,0 +1,90 @@
+"""Inertia that the base parameters do not hold."""
+
+import zlib
+from collections.abc import Iterable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..parameters import Scalar, Vector, as_float64, parameter
+from ._base import AbstractEffect, Motion, on_joint
+from ._scene import Scene
+
+
+class RotorInertia(AbstractEffect):
+    """Inertia of a drive behind its gear: J a; joint 2 and further."""
+
+    joint: int = eqx.field(static=True)
+    inertia: Scalar = parameter(0.0, symbol="Ia", unit="kg·m²", lower=0.0, scale=0.05)
+    inertial = True
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["RotorInertia"]:
+        """Joint 2 and further: the first joint's is part of its base inertia."""
+        return [cls(joint=j) for j in scene.joints if j > 1]
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """J a on the joint, `(joints,)`."""
+        return on_joint(self.joint, self.inertia * motion.a[self.joint - 1], motion)
+
+
+class Payload(AbstractEffect):
+    """A point mass on the last link, on all or on named recordings.
+
+    `lengths` are those of the links before the last (m), `reach` the mass's distance along the
+    last, `g` gravity in the plane with angles from hanging down (m/s²). On a sliding joint it is
+    a mass on the carriage.
+    """
+
+    mass: Scalar = parameter(0.0, symbol="payload", unit="kg", lower=0.0, scale=0.1)
+    reach: Scalar = parameter(0.3, symbol="reach", unit="m", lower=0.0, scale=0.1, linear=False)
+    recordings: tuple[str, ...] = eqx.field(static=True, default=())
+    lengths: Vector = eqx.field(converter=as_float64, default=(0.5,))
+    g: Scalar = eqx.field(converter=as_float64, default=0.0)
+    slides: bool = eqx.field(static=True, default=False)
+    inertial = True
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["Payload"]:
+        """Each recording in turn: on all of them it cannot be told from the link's own mass."""
+        if len(scene.recordings) < 2:
+            return []
+        slides = any(scene.slides)
+        reaches = (0.0,) if slides else (0.1, 0.2, 0.35, 0.5)
+        return [
+            cls(recordings=(name,), reach=reach, lengths=scene.lengths, g=scene.g, slides=slides)
+            for name in scene.recordings
+            for reach in reaches
+        ]
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """What it takes to carry the mass along, `(joints,)`."""
+        if self.slides:
+            asked = self.mass * motion.a
+        else:
+            asked = self.mass * self._jacobian(motion.q).T @ self._lift(motion)
+        if not self.recordings:
+            return asked
+        labels = [zlib.crc32(name.encode()) & 0x7FFFFFFF for name in self.recordings]
+        carried = jnp.any(motion.label == jnp.asarray(labels))
+        return jnp.where(carried, asked, 0.0)
+
+    def _place(self, q: Float[Array, " joints"]) -> Float[Array, " two"]:
+        angle = jnp.cumsum(q)
+        lengths = jnp.append(self.lengths, self.reach)
+        return jnp.stack([lengths @ jnp.sin(angle), -lengths @ jnp.cos(angle)])
+
+    def _jacobian(self, q: Float[Array, " joints"]) -> Float[Array, "two joints"]:
+        return jax.jacfwd(self._place)(q)
+
+    def _lift(self, motion: Motion) -> Float[Array, " two"]:
+        """Acceleration of the mass, gravity taken off."""
+
+        def velocity(q: Float[Array, " joints"]) -> Float[Array, " two"]:
+            return jax.jvp(self._place, (q,), (motion.v,))[1]
+
+        turning = jax.jvp(velocity, (motion.q,), (motion.v,))[1]
+        up = jnp.stack([jnp.zeros(()), self.g])
+        return self._jacobian(motion.q) @ motion.a + turning + up

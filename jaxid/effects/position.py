@@ -1,0 +1,115 @@
+"""Torque that depends on position: ripple, springs, end stops, gravity."""
+
+from collections.abc import Iterable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..parameters import Scalar, Vector, parameter
+from ._base import AbstractEffect, Motion, on_joint
+from ._scene import Scene
+
+
+class TorqueRipple(AbstractEffect):
+    """Cogging and gear ripple: A cos(n q) + B sin(n q), n unknown."""
+
+    joint: int = eqx.field(static=True)
+    A: Scalar = parameter(0.0, symbol="RA", unit="N·m", scale=0.1)
+    B: Scalar = parameter(0.0, symbol="RB", unit="N·m", scale=0.1)
+    harmonic: Scalar = parameter(1.0, symbol="n", unit="1/rad", lower=1e-3, scale=5.0, linear=False)
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["TorqueRipple"]:
+        """Harmonics up to thirty waves over the travel, a third of a wave apart.
+
+        Below one and a half waves ripple is a bend like any other, and is left to springs.
+        """
+        return [
+            cls(joint=j, harmonic=2 * np.pi * waves / scene.travel(j))
+            for j in scene.joints
+            for waves in np.arange(1.5, 30.0, 1 / 3)
+        ]
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """The wave on the joint, `(joints,)`."""
+        angle = self.harmonic * motion.q[self.joint - 1]
+        wave = self.A * jnp.cos(angle) + self.B * jnp.sin(angle)
+        return on_joint(self.joint, wave, motion)
+
+
+class TorqueOffset(AbstractEffect):
+    """A constant torque at one joint: amplifier offset, a balance weight that is off."""
+
+    joint: int = eqx.field(static=True)
+    level: Scalar = parameter(0.0, symbol="offset", unit="N·m", scale=0.1)
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """The offset on the joint, `(joints,)`."""
+        return on_joint(self.joint, self.level, motion)
+
+
+class Spring(AbstractEffect):
+    """Hoses and cables: k (q - q0), with the preload k q0 as parameter."""
+
+    joint: int = eqx.field(static=True)
+    stiffness: Scalar = parameter(0.0, symbol="k", unit="N·m/rad", scale=0.1)
+    preload: Scalar = parameter(0.0, symbol="kq0_", unit="N·m", scale=0.1)
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """k q - k q0 on the joint, `(joints,)`."""
+        pull = self.stiffness * motion.q[self.joint - 1] - self.preload
+        return on_joint(self.joint, pull, motion)
+
+
+class EndStop(AbstractEffect):
+    """A stiff spring beyond an angle: k (q - qe) where q is beyond qe.
+
+    `side` is 1 for the upper end, -1 for the lower.
+    """
+
+    joint: int = eqx.field(static=True)
+    stiffness: Scalar = parameter(0.0, symbol="ke", unit="N·m/rad", lower=0.0, scale=1.0)
+    angle: Scalar = parameter(0.0, symbol="qe", unit="rad", scale=0.1, linear=False)
+    side: int = eqx.field(static=True, default=1)
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["EndStop"]:
+        """Angles in the outer quarter of the travel, at both ends."""
+        return [
+            cls(joint=j, angle=end - side * share * scene.travel(j), side=side)
+            for j in scene.joints
+            for side, end in ((1, scene.q_high[j - 1]), (-1, scene.q_low[j - 1]))
+            for share in (0.03, 0.07, 0.12, 0.18, 0.25)
+        ]
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """The stop's push on the joint, `(joints,)`."""
+        beyond = jnp.maximum(self.side * (motion.q[self.joint - 1] - self.angle), 0.0)
+        return on_joint(self.joint, self.side * self.stiffness * beyond, motion)
+
+
+class Gravity(AbstractEffect):
+    """A base that is not level, or gravity at all, on a planar arm of turning joints.
+
+    Every link adds G cos(phi) + H sin(phi), with phi its angle in the plane, to its own joint and
+    those before it.
+    """
+
+    G: Vector = parameter((0.0, 0.0), symbol="G", unit="N·m", scale=0.1)
+    H: Vector = parameter((0.0, 0.0), symbol="H", unit="N·m", scale=0.1)
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["Gravity"]:
+        """One, for arms that turn; on a sliding joint gravity is an offset."""
+        if any(scene.slides):
+            return []
+        zeros = (0.0,) * len(scene.slides)
+        return [cls(zeros, zeros)]
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """Gravity of each link and of those it carries, `(joints,)`."""
+        angle = jnp.cumsum(motion.q)
+        own = self.G * jnp.cos(angle) + self.H * jnp.sin(angle)
+        return jnp.cumsum(own[::-1])[::-1]

@@ -1,0 +1,95 @@
+"""What gives way between drive and link: elasticity, backlash."""
+
+from collections.abc import Iterable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..parameters import Scalar, parameter
+from ._base import AbstractTransmission
+from ._scene import Scene
+
+
+class JointElasticity(AbstractTransmission):
+    """A compliant transmission: torque (drive - link) / compliance, slightly damped (Spong 1987).
+
+    `rotor` is the part of the joint's inertia that sits on the drive; `damping` the time by which
+    the torque runs ahead, s.
+    """
+
+    joint: int = eqx.field(static=True)
+    compliance: Scalar = parameter(
+        0.0, symbol="compliance", unit="rad/(N·m)", lower=0.0, scale=0.01, linear=False
+    )
+    rotor: Scalar = parameter(0.01, symbol="Jm", unit="kg·m²", lower=1e-6, scale=0.1, linear=False)
+    damping: Scalar = parameter(
+        1e-3, symbol="dk", unit="s", lower=0.0, scale=1e-3, free=False, linear=False
+    )
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["JointElasticity"]:
+        """Resonances against the link at a twentieth and a tenth of the sample rate."""
+        made = []
+        for j in scene.joints:
+            inertia = scene.inertia[j - 1]
+            for share in (0.05, 0.1):
+                rate = 2 * np.pi * share / scene.period
+                made.append(cls(joint=j, compliance=1 / (inertia * rate**2), rotor=0.3 * inertia))
+        return made
+
+    def present(self) -> Bool[Array, ""]:
+        """Where there is compliance."""
+        return self.compliance > 0
+
+    def through(self, twist: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
+        """Torque passed on, N·m."""
+        soft = jnp.where(self.compliance > 0, self.compliance, 1.0)
+        return -(twist + self.damping * rate) / soft
+
+
+class Backlash(AbstractTransmission):
+    """A gap in the transmission, with stiff contact on both sides.
+
+    `gap` is its whole width; `rotor` as for `JointElasticity`; contact stiffness and damping are
+    given, not estimated.
+    """
+
+    joint: int = eqx.field(static=True)
+    gap: Scalar = parameter(0.0, symbol="gap", unit="rad", lower=0.0, scale=0.01, linear=False)
+    rotor: Scalar = parameter(0.01, symbol="Jm", unit="kg·m²", lower=1e-6, scale=0.1, linear=False)
+    stiffness: Scalar = parameter(
+        100.0, symbol="kc", unit="N·m/rad", lower=0.0, scale=100.0, free=False, linear=False
+    )
+    damping: Scalar = parameter(
+        0.003, symbol="dk", unit="s", lower=0.0, scale=0.01, free=False, linear=False
+    )
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["Backlash"]:
+        """Gaps of a few thousandths of the travel; contact a quarter of the sample rate stiff."""
+        made = []
+        for j in scene.joints:
+            inertia = scene.inertia[j - 1]
+            stiffness = 0.21 * inertia * (0.25 / scene.period * 2 * np.pi) ** 2
+            for share in (0.003, 0.008):
+                made.append(
+                    cls(
+                        joint=j,
+                        gap=share * scene.travel(j),
+                        rotor=0.3 * inertia,
+                        stiffness=stiffness,
+                    )
+                )
+        return made
+
+    def present(self) -> Bool[Array, ""]:
+        """Where there is a gap."""
+        return self.gap > 0
+
+    def through(self, twist: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
+        """Torque passed on, N·m; nothing inside the gap."""
+        depth = jnp.maximum(jnp.abs(twist) - self.gap / 2, 0.0)
+        damped = jnp.where(depth > 0, self.damping * rate, 0.0)
+        return -self.stiffness * (jnp.sign(twist) * depth + damped)

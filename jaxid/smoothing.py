@@ -1,0 +1,128 @@
+"""Zero-phase low-passes: how far up a recorded motion is signal, and the filter that keeps it."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from scipy import interpolate, signal
+
+from .errors import RecordingError
+from .recording import Recording
+
+ORDER = 4
+
+
+def low_pass(
+    x: Float[np.ndarray, "samples columns"], rate: float, cutoff: float, order: int = ORDER
+) -> Float[np.ndarray, "samples columns"]:
+    """Even samples through a Butterworth low-pass, forward and backward.
+
+    **Arguments:**
+
+    - `x`: `(samples, columns)`.
+    - `rate`: samples in a second, Hz. `cutoff`: of the filter, Hz.
+    """
+    sections = signal.butter(order, cutoff, fs=rate, output="sos")
+    # SciPy's own choice of padding is shorter than the filter remembers, and then a signal that
+    # moves at its end is bent there.
+    pad = min(len(x) - 1, int(np.ceil(4 * rate / cutoff)))
+    return signal.sosfiltfilt(sections, x, axis=0, padlen=pad)
+
+
+def even_times(recording: Recording) -> Float[np.ndarray, " samples"]:
+    """As many even times as a recording has samples, over the same span, s."""
+    return np.linspace(recording.time[0], recording.time[-1], recording.samples)
+
+
+def resampled(
+    time: Float[np.ndarray, " samples"],
+    x: Float[np.ndarray, "samples columns"],
+    at: Float[np.ndarray, " samples"],
+) -> Float[np.ndarray, "samples columns"]:
+    """Samples at other times, by a cubic spline where the two differ."""
+    if np.allclose(time, at, rtol=0, atol=1e-6 * (time[1] - time[0])):
+        return x
+    return interpolate.CubicSpline(time, x)(at)
+
+
+def smooth_motion(
+    recording: Recording, cutoff: float, order: int = ORDER
+) -> Float[np.ndarray, "samples joints"]:
+    """The recorded position, low-passed, at the recording's even times, rad or m."""
+    q = resampled(recording.time, recording.q, even_times(recording))
+    return low_pass(q, recording.rate, cutoff, order)
+
+
+def signal_cutoff(recording: Recording) -> float:
+    """The frequency in Hz above which a recorded motion says no more about acceleration.
+
+    The spectrum of the acceleration, f⁴ times that of position, falls until the encoder's noise
+    lifts it again: where it first comes within a factor two of its lowest point, all joints
+    together, each relative to its speed. At most an eighth of the sample rate; a tenth where the
+    recording is too short for a spectrum.
+    """
+    n, rate = recording.samples, recording.rate
+    if n < 200:
+        return rate / 10
+    q = signal.detrend(resampled(recording.time, recording.q, even_times(recording)), axis=0)
+    # A window whose side lobes stay below the noise, for the motion is 10¹⁰ times as strong.
+    power = np.abs(np.fft.rfft(q * signal.windows.blackmanharris(n)[:, None], axis=0)) ** 2
+    f = np.fft.rfftfreq(n, 1 / rate)
+    edges = np.unique(np.round(np.geomspace(4, n // 2, 40)).astype(int))
+    bands = list(zip(edges[:-1], edges[1:], strict=True))
+    centre = np.array([f[low:high].mean() for low, high in bands])
+    # A joint that stands still has no speed to be relative to, and nothing to say.
+    speed = (power * f[:, None] ** 2).sum(axis=0)
+    share = (power / np.where(speed > 0, speed, np.inf)).sum(axis=1)
+    level = np.array([share[low:high].mean() for low, high in bands])
+    moving = int(np.argmax(level * centre**2))
+    acceleration = (level * centre**4)[moving:]
+    settled = int(np.argmax(acceleration <= 2 * acceleration.min()))
+    return float(min(centre[moving + settled], rate / 8))
+
+
+class Band(eqx.Module):
+    """The part of signals that is compared: frequencies, by a zero-phase filter, and samples.
+
+    `gain` is the filter's at the frequencies of a real Fourier transform, `keep` says which
+    samples are far enough from the ends.
+    """
+
+    gain: Float[Array, "recordings frequencies"]
+    keep: Bool[Array, "recordings samples"]
+
+    @classmethod
+    def of(cls, recordings: list[Recording], cutoffs: list[float], samples: int) -> "Band":
+        """The band of recordings that are padded to `samples`.
+
+        **Arguments:**
+
+        - `cutoffs`: of each recording's low-pass, Hz.
+
+        **Raises:** `RecordingError` where a recording is over before the filter has settled.
+        """
+        rows, kept = [], np.zeros((len(recordings), samples), bool)
+        memory = max(r.rate / c for r, c in zip(recordings, cutoffs, strict=True))
+        size = 1 << int(np.ceil(np.log2(samples + 4 * memory)))
+        for k, (r, cutoff) in enumerate(zip(recordings, cutoffs, strict=True)):
+            sections = signal.butter(ORDER, cutoff, fs=r.rate, output="sos")
+            grid = np.fft.rfftfreq(size, 1 / r.rate)
+            rows.append(np.abs(signal.sosfreqz(sections, grid, fs=r.rate)[1]) ** 2)
+            trim = int(np.ceil(2 * r.rate / cutoff))
+            kept[k, trim : r.samples - trim] = True
+            if r.samples - 2 * trim < 10:
+                raise RecordingError(
+                    f"{r.name} lasts {r.duration:.3g} s, and {2 / cutoff:.3g} s at each end are "
+                    f"lost to its low-pass at {cutoff:.3g} Hz: give longer recordings or windows"
+                )
+        return cls(jnp.asarray(np.stack(rows)), jnp.asarray(kept))
+
+    def __call__(
+        self, x: Float[Array, "recordings samples *axes"]
+    ) -> Float[Array, "recordings samples *axes"]:
+        """Signals, zero where there is no sample, through the filter; zero at the ends."""
+        axes = (1,) * (x.ndim - 2)
+        size = 2 * (self.gain.shape[1] - 1)
+        wave = jnp.fft.rfft(x, size, axis=1) * self.gain.reshape(*self.gain.shape, *axes)
+        passed = jnp.fft.irfft(wave, size, axis=1)[:, : x.shape[1]]
+        return passed * self.keep.reshape(*self.keep.shape, *axes)
