@@ -8,7 +8,11 @@ from . import arms as arms  # noqa: E402
 from . import control as control  # noqa: E402
 from . import effects as effects  # noqa: E402
 from .discovery import Comparison as Comparison  # noqa: E402
+from .discovery import Diagnosis as Diagnosis  # noqa: E402
+from .discovery import Discovery as Discovery  # noqa: E402
 from .discovery import compare as compare  # noqa: E402
+from .discovery import diagnose as diagnose  # noqa: E402
+from .discovery import discover as discover  # noqa: E402
 from .effects import Curve as Curve  # noqa: E402
 from .effects import catalogue as catalogue  # noqa: E402
 from .estimate import DIDIM as DIDIM  # noqa: E402

@@ -34,9 +34,7 @@ def turned(angle, vector):
 def centres(q, links):
     """Centres of mass of two links in the plane, (links, 2), m; both lie along x at q = 0."""
     elbow = turned(q[0], jnp.array([LENGTH, 0.0]))
-    return jnp.stack(
-        [turned(q[0], links["com"][0]), elbow + turned(q[0] + q[1], links["com"][1])]
-    )
+    return jnp.stack([turned(q[0], links["com"][0]), elbow + turned(q[0] + q[1], links["com"][1])])
 
 
 def lagrangian(q, v, links, gravity):

@@ -275,9 +275,7 @@ def test_sensor_noise_goes_round_the_loop():
     # What is read is where the arm is, and the noise; its rate is that of the lines between.
     np.testing.assert_allclose(noisy.q - noisy.states[:, :2], noise, rtol=0, atol=1e-14)
     slope = np.diff(noise, axis=0) / np.diff(run.time)[:, None]
-    np.testing.assert_allclose(
-        (noisy.v - noisy.states[:, 2:4])[:-1], slope, rtol=0, atol=1e-11
-    )
+    np.testing.assert_allclose((noisy.v - noisy.states[:, 2:4])[:-1], slope, rtol=0, atol=1e-11)
     first = -kg * (kp * noise[0] + kv * slope[0])
     np.testing.assert_allclose((noisy.tau - clean.tau)[0], first, rtol=0, atol=1e-12)
     # It moves the arm.

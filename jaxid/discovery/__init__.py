@@ -2,3 +2,7 @@
 
 from .compare import Comparison as Comparison
 from .compare import compare as compare
+from .diagnose import Diagnosis as Diagnosis
+from .diagnose import diagnose as diagnose
+from .discover import Discovery as Discovery
+from .discover import discover as discover

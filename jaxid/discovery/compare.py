@@ -201,7 +201,9 @@ def _errors(loop: ClosedLoop, recordings: Recordings, runs: tuple[Simulated, ...
         recordings, position, [r.q - np.asarray(run.q) for r, run in pairs]
     )
     # A velocity that was not measured is derived from position without delay.
-    velocity = [filtered(r, Filtering()).v if r.v is None else r.v for r in recordings]
+    velocity = [
+        filtered(r, Filtering(cutoff=r.rate / 10)).v if r.v is None else r.v for r in recordings
+    ]
     tables["velocity"] = relative_errors(
         recordings,
         [np.asarray(v) for v in velocity],

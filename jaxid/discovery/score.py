@@ -1,4 +1,4 @@
-"""Score statistics: what each hypothesis explains of the whitened residual, and how likely by chance."""
+"""Score statistics: what each hypothesis explains of the whitened residual, and by what chance."""
 
 from collections.abc import Sequence
 
@@ -184,7 +184,7 @@ def select(gram: Gram, blocks: Sequence[Sequence[int]], most: int, margin: float
 def estimate_noise(
     data: Data, blocks: Sequence[Sequence[int]]
 ) -> tuple[tuple[ARFilter, ...], list[int]]:
-    """The noise filter with everything in the model that could be physics (no AR filter of a spring).
+    """The noise filter with everything in the model that could be physics (not of a spring's pull).
 
     A rich model (base and all signatures, slightly ridged) leaves the first estimate; it takes a
     share of the noise with it. With that filter the few signatures that matter are picked, and

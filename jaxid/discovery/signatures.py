@@ -45,11 +45,6 @@ def amplitudes(effect: AbstractEffect) -> tuple[Parameter, ...]:
     return tuple(p for p in list_parameters(effect) if p.declaration.free and p.declaration.linear)
 
 
-def is_curve(effect: AbstractEffect) -> bool:
-    """Whether an effect is the free-form hypothesis."""
-    return isinstance(effect, Curve)
-
-
 # --- which hypotheses --------------------------------------------------------------------------
 
 
@@ -193,9 +188,6 @@ def _forces(
         return jax.jacfwd(along)(read_values(effect, linear))
     push, noise = along(jnp.zeros(0))
     return push[..., None], noise[..., None]
-
-
-Group = tuple[AbstractEffect, int]
 
 
 @eqx.filter_jit

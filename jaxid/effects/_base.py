@@ -65,6 +65,10 @@ class AbstractEffect(eqx.Module):
             return [cls()]
         return [cls(joint=j) for j in scene.joints]  # type: ignore[call-arg]
 
+    def scaled(self, factor: float) -> Self:
+        """The effect at another size, where a finite setting was screened; itself by default."""
+        return self
+
     def initial_state(self) -> Float[Array, " states"]:
         """Its own states at rest; none by default."""
         return jnp.zeros(0)

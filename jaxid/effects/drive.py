@@ -1,5 +1,6 @@
 """What happens to a torque between command and joint: gain, lag, delay, saturation."""
 
+import dataclasses
 from collections.abc import Iterable
 
 import equinox as eqx
@@ -35,6 +36,10 @@ class ActuatorLag(AbstractEffect):
         """One small lag a joint: how large it is shows in the refit."""
         return [cls(joint=j, time_constant=scene.period) for j in scene.joints]
 
+    def scaled(self, factor: float) -> "ActuatorLag":
+        """The time constant times a factor."""
+        return dataclasses.replace(self, time_constant=self.time_constant * factor)
+
     def initial_state(self) -> Float[Array, " states"]:
         """No torque yet, `(1,)`."""
         return jnp.zeros(1)
@@ -64,6 +69,10 @@ class TimeDelay(AbstractEffect):
     def screened(cls, scene: Scene) -> Iterable["TimeDelay"]:
         """One small delay a joint: how large it is shows in the refit."""
         return [cls(joint=j, delay=scene.period) for j in scene.joints]
+
+    def scaled(self, factor: float) -> "TimeDelay":
+        """The delay times a factor."""
+        return dataclasses.replace(self, delay=self.delay * factor)
 
     def initial_state(self) -> Float[Array, " states"]:
         """Nothing on its way, `(2,)`."""

@@ -1,5 +1,6 @@
 """What gives way between drive and link: elasticity, backlash."""
 
+import dataclasses
 from collections.abc import Iterable
 
 import equinox as eqx
@@ -38,6 +39,10 @@ class JointElasticity(AbstractTransmission):
                 rate = 2 * np.pi * share / scene.period
                 made.append(cls(joint=j, compliance=1 / (inertia * rate**2), rotor=0.3 * inertia))
         return made
+
+    def scaled(self, factor: float) -> "JointElasticity":
+        """The compliance times a factor."""
+        return dataclasses.replace(self, compliance=self.compliance * factor)
 
     def present(self) -> Bool[Array, ""]:
         """Where there is compliance."""
@@ -83,6 +88,10 @@ class Backlash(AbstractTransmission):
                     )
                 )
         return made
+
+    def scaled(self, factor: float) -> "Backlash":
+        """The gap times a factor."""
+        return dataclasses.replace(self, gap=self.gap * factor)
 
     def present(self) -> Bool[Array, ""]:
         """Where there is a gap."""

@@ -1,16 +1,15 @@
 """The residual of a simulated loop as a function of its parameters, and its minimisation."""
 
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from ..loop import ClosedLoop
-from ..parameters import Bounds
 from ..simulate import SIGNALS, Batch, initial, run_with_sensitivities
 from ._base import Status
 
@@ -67,156 +66,225 @@ def sensitivity(
     return Sensitivity(residual, slopes[..., :p], slopes[..., p:] if free_start else None)
 
 
-def absorb_start(
-    found: Sensitivity, free: Float[Array, " recordings"]
-) -> tuple[Sensitivity, Float[Array, "recordings initials"]]:
-    """Takes out what initial states can explain (variable projection, Kaufman 1975).
+def absorb_start(found: Sensitivity, free: Float[Array, " recordings"]) -> Sensitivity:
+    """Takes out of the derivatives what initial states can explain as well.
 
     **Arguments:**
 
     - `free`: one for recordings whose initial state is estimated, else zero.
-
-    **Returns:** residual and derivatives with that removed, and the step of the initial states.
     """
-    assert found.start is not None
-    shape = found.residual.shape
+    if found.start is None:
+        return found
+    count, p = found.jacobian.shape[0], found.jacobian.shape[-1]
+    j = found.jacobian.reshape(count, -1, p)
+    s = (found.start * free[:, None, None, None]).reshape(count, j.shape[1], -1)
+    # Columns may be alike, or nil where a start is given: only a full decomposition says so.
+    basis, size, _ = jnp.linalg.svd(s, full_matrices=False)
+    basis = jnp.where((size > 1e-10 * size[:, :1])[:, None, :], basis, 0.0)
+    j = j - basis @ jnp.einsum("rka,rkp->rap", basis, j)
+    return Sensitivity(found.residual, j.reshape(found.jacobian.shape), None)
 
-    def one(residual, jacobian, start, flag):
-        flat = start.reshape(-1, start.shape[-1])
-        basis, triangle = jnp.linalg.qr(flat)
-        basis = flag * basis
-        r, j = residual.reshape(-1), jacobian.reshape(-1, jacobian.shape[-1])
-        along = basis.T @ r
-        step = -flag * jnp.linalg.lstsq(triangle, along)[0]
-        return r - basis @ along, j - basis @ (basis.T @ j), step
 
-    r, j, step = jax.vmap(one)(found.residual, found.jacobian, found.start, free)
-    return Sensitivity(r.reshape(shape), j.reshape(*shape, -1), None), step
+class Point(eqx.Module):
+    """A set of parameter values and initial states, and the least-squares problem around it.
+
+    - `theta`: parameter values; `start`: initial position and velocity of each recording.
+    - `loss`: sum of squared weighted residuals; infinite where values are not physical or the
+      simulation fails.
+    - `gram`, `slope`: J'J and J'r for the parameters; `start_gram`, `start_slope` for the initial
+      states of each recording, and `cross` between the two.
+    """
+
+    theta: Float[Array, " parameters"]
+    start: Float[Array, "recordings initials"]
+    found: Sensitivity
+    loss: Float[Array, ""]
+    gram: Float[Array, "parameters parameters"]
+    slope: Float[Array, " parameters"]
+    start_gram: Float[Array, "recordings initials initials"]
+    start_slope: Float[Array, "recordings initials"]
+    cross: Float[Array, "recordings initials parameters"]
 
 
 class Problem(eqx.Module):
-    """The least-squares problem in unbounded coordinates, for optimistix.
+    """Which residual is minimised, and where its parameters may go.
 
-    Where values are not physical or the simulation fails, the residual is so large that the step
-    is refused.
+    - `free`: one for recordings whose initial state is estimated, else zero.
     """
 
     loop: ClosedLoop
     batch: Batch
     weights: Float[Array, " outputs"]
     free: Float[Array, " recordings"]
-    bounds: Bounds
+    lower: Float[Array, " parameters"]
+    upper: Float[Array, " parameters"]
     signals: tuple[str, ...] = eqx.field(static=True)
     free_start: bool = eqx.field(static=True)
 
-    def at(self, z: Float[Array, " parameters"]) -> tuple[Sensitivity, Array]:
-        """Residual with derivatives by z, and the step of the initial states."""
-        loop = self.loop.with_theta(self.bounds.inside(z))
-        found = sensitivity(loop, self.batch, self.weights, self.signals, self.free_start)
-        step = jnp.zeros((self.free.shape[0], 2 * loop.joints))
-        if self.free_start:
-            found, step = absorb_start(found, self.free)
-        physical = loop.arm.smallest_inertia() > 0
-        usable = physical & jnp.all(jnp.isfinite(found.residual))
-        usable = usable & jnp.all(jnp.isfinite(found.jacobian))
-        residual = jnp.where(usable, found.residual, REFUSED)
-        jacobian = jnp.where(usable, found.jacobian, 0.0)
-        return Sensitivity(residual, jacobian, None), step
-
-    def __call__(self, z: Float[Array, " parameters"], args: None):
-        """The flat residual, with the sensitivities as auxiliary output."""
-
-        @jax.custom_jvp
-        def evaluate(z):
-            found, step = self.at(z)
-            return found.residual.reshape(-1), (found, step)
-
-        @evaluate.defjvp
-        def evaluate_jvp(primals, tangents):
-            (z,), (dz,) = primals, tangents
-            found, step = self.at(z)
-            slope = jax.vmap(lambda d: jax.jvp(self.bounds.inside, (z,), (d,))[1])
-            by_z = found.jacobian.reshape(-1, z.shape[0]) @ slope(jnp.eye(z.shape[0])).T
-            aux = (found, step)
-            # The sensitivities are reported, not differentiated.
-            still = jax.tree.map(jnp.zeros_like, aux)
-            return (found.residual.reshape(-1), aux), (by_z @ dz, still)
-
-        return evaluate(z)
-
-
-REFUSED = 1e6
-
 
 @eqx.filter_jit
-def _begin(problem: Problem, solver: optx.LevenbergMarquardt, z: Float[Array, " parameters"]):
-    return eqx.filter(_fresh(problem, solver, z), eqx.is_array)
-
-
-def _fresh(problem: Problem, solver: optx.LevenbergMarquardt, z: Float[Array, " parameters"]):
-    f_struct, aux_struct = eqx.filter_eval_shape(problem, z, None)
-    return solver.init(problem, z, None, {}, f_struct, aux_struct, frozenset())
-
-
-@eqx.filter_jit
-def _step(problem: Problem, solver: optx.LevenbergMarquardt, z: Float[Array, " parameters"], carry):
-    # optimistix keeps traced functions in its state; only arrays may cross the boundary of a
-    # compiled step, so that one compilation serves every fit of this structure.
-    static = eqx.filter(_fresh(problem, solver, z), eqx.is_array, inverse=True)
-    state = eqx.combine(carry, static)
-    z, state, _ = solver.step(problem, z, None, {}, state, frozenset())
-    loss = jnp.sum(state.f_info.residual**2)
-    return z, eqx.filter(state, eqx.is_array), state.aux, loss, state.terminate
+def linearise(
+    problem: Problem,
+    theta: Float[Array, " parameters"],
+    start: Float[Array, "recordings initials"],
+) -> Point:
+    """The problem around parameter values and initial states."""
+    n = problem.loop.joints
+    loop = problem.loop.with_theta(theta)
+    batch = dataclasses.replace(problem.batch, q0=start[:, :n], v0=start[:, n:])
+    found = sensitivity(loop, batch, problem.weights, problem.signals, problem.free_start)
+    count, p = start.shape[0], theta.shape[0]
+    r = found.residual.reshape(count, -1)
+    j = found.jacobian.reshape(count, -1, p)
+    if found.start is None:
+        s = jnp.zeros((count, r.shape[1], 0))
+    else:
+        s = found.start.reshape(count, r.shape[1], -1) * problem.free[:, None, None]
+    loss = jnp.sum(r**2)
+    sound = jnp.isfinite(loss) & jnp.all(jnp.isfinite(j)) & jnp.all(jnp.isfinite(s))
+    sound = sound & (loop.arm.smallest_inertia() > 0)
+    return Point(
+        theta,
+        start,
+        found,
+        jnp.where(sound, loss, jnp.inf),
+        jnp.einsum("rkp,rkq->pq", j, j),
+        jnp.einsum("rkp,rk->p", j, r),
+        jnp.einsum("rka,rkb->rab", s, s),
+        jnp.einsum("rka,rk->ra", s, r),
+        jnp.einsum("rka,rkp->rap", s, j),
+    )
 
 
 class Minimum(eqx.Module):
     """Where a minimisation ended."""
 
-    z: Float[Array, " parameters"]
-    found: Sensitivity
-    start_step: Float[Array, "recordings initials"]
+    point: Point
     status: Status = eqx.field(static=True)
     iterations: int = eqx.field(static=True)
 
 
+class _Scales(eqx.Module):
+    """Squared sizes of columns, the largest met so far (Moré 1978)."""
+
+    theta: Float[np.ndarray, " parameters"]
+    start: Float[np.ndarray, "recordings initials"]
+
+    @classmethod
+    def of(cls, point: Point, before: "_Scales | None" = None) -> "_Scales":
+        theta = np.diag(np.asarray(point.gram))
+        start = np.einsum("raa->ra", np.asarray(point.start_gram))
+        if before is not None:
+            theta, start = np.maximum(theta, before.theta), np.maximum(start, before.start)
+        return cls(theta, start)
+
+
+def _step(
+    problem: Problem, point: Point, scales: _Scales, damping: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """A damped Gauss-Newton step inside the bounds, and how much it should lower the loss.
+
+    Initial states are eliminated recording by recording, so that their number costs little.
+    A parameter that stands on a bound and is pushed against it stays there.
+    """
+    theta, start = np.asarray(point.theta), np.asarray(point.start)
+    lower, upper = np.asarray(problem.lower), np.asarray(problem.upper)
+    slope, start_slope = np.asarray(point.slope), np.asarray(point.start_slope)
+    gram, cross = np.asarray(point.gram), np.asarray(point.cross)
+    initials = cross.shape[1]
+    own = np.asarray(point.start_gram) + _diagonal(damping * scales.start)
+    pair = np.concatenate([cross, start_slope[..., None]], axis=2)
+    inner = np.linalg.solve(own, pair) if initials else pair
+    reduced = gram + np.diag(damping * np.where(scales.theta > 0, scales.theta, 1.0))
+    reduced = reduced - np.einsum("rap,raq->pq", cross, inner[..., :-1])
+    push = slope - np.einsum("rap,ra->p", cross, inner[..., -1])
+    step = _within(reduced, push, lower - theta, upper - theta)
+    start_step = -inner[..., -1] - inner[..., :-1] @ step
+    gain = -2 * (slope @ step + np.sum(start_slope * start_step)) - step @ gram @ step
+    gain -= 2 * np.einsum("ra,rap,p->", start_step, cross, step)
+    gain -= np.einsum("ra,rab,rb->", start_step, np.asarray(point.start_gram), start_step)
+    full = np.zeros_like(start)
+    full[:, :initials] = start_step
+    return step, full, float(gain)
+
+
+def _within(
+    gram: Float[np.ndarray, "parameters parameters"],
+    slope: Float[np.ndarray, " parameters"],
+    low: Float[np.ndarray, " parameters"],
+    high: Float[np.ndarray, " parameters"],
+) -> Float[np.ndarray, " parameters"]:
+    """The step that solves `gram step = -slope` for those that do not end on a bound."""
+    step = np.where((low >= 0) & (slope > 0), low, 0.0)
+    step = np.where((high <= 0) & (slope < 0), high, step)
+    open_ = ~(((low >= 0) & (slope > 0)) | ((high <= 0) & (slope < 0)))
+    unit = np.sqrt(np.diag(gram))
+    while open_.any():
+        some = np.ix_(open_, open_)
+        scaled = gram[some] / np.outer(unit[open_], unit[open_])
+        right = slope[open_] + gram[np.ix_(open_, ~open_)] @ step[~open_]
+        step[open_] = -np.linalg.solve(scaled, right / unit[open_]) / unit[open_]
+        beyond = open_ & ((step < low) | (step > high))
+        if not beyond.any():
+            break
+        # Those that would go beyond a bound stop there, and the others make up for it.
+        step = np.where(beyond, np.clip(step, low, high), step)
+        open_ = open_ & ~beyond
+    return step
+
+
+def _diagonal(values: np.ndarray) -> np.ndarray:
+    """Diagonal matrices of rows; one where there is nothing to scale by."""
+    return np.where(values > 0, values, 1.0)[..., None] * np.eye(values.shape[-1])
+
+
 def minimise(
     problem: Problem,
-    z: Float[Array, " parameters"],
-    solver: optx.LevenbergMarquardt,
+    theta: Float[Array, " parameters"],
+    start: Float[Array, "recordings initials"],
+    tolerance: float,
+    worth: float,
     max_steps: int,
     say: Callable[[str], None],
 ) -> Minimum:
-    """Levenberg–Marquardt by optimistix, one compiled step at a time.
+    """Levenberg–Marquardt inside bounds, over parameters and initial states together.
+
+    Damping after Nielsen 1999, scaling after Moré 1978. optimistix's solver knows neither bounds
+    nor that initial states concern one recording each, and would factor all of them at once.
 
     **Arguments:**
 
-    - `z`: start, in the problem's coordinates.
+    - `theta`, `start`: where to start, `(parameters,)` and `(recordings, 2 · joints)`.
+    - `tolerance`: it stops when a step is shorter than this many standard deviations, or
+    - `worth`: when five steps together lower the loss by less than this share.
     - `max_steps`: largest number of steps, refused ones included.
     - `say`: told about every step.
     """
-    carry = _begin(problem, solver, z)
-    best, refused, still, last = np.inf, 0, 0, None
-    for k in range(1, max_steps + 1):
-        z, carry, last, loss, done = _step(problem, solver, z, carry)
-        loss = float(loss)
-        say(f"iteration {k}, weighted squared error {loss:.6g}")
-        if k == 1 and loss >= REFUSED**2:
-            return Minimum(z, last[0], last[1], Status.diverged, k)
-        refused = refused + 1 if loss >= best else 0
-        # A parameter that leans on its bound moves on for ever without changing anything.
-        still = still + 1 if 0 <= best - loss < 1e-9 * loss and not refused else 0
-        best = min(best, loss)
-        if bool(done) or still >= 3 or (refused >= 3 and flat(last[0])):
-            return Minimum(z, last[0], last[1], Status.converged, k)
-        if refused >= 25:
-            return Minimum(z, last[0], last[1], Status.stalled, k)
-    assert last is not None
-    return Minimum(z, last[0], last[1], Status.max_steps, max_steps)
-
-
-def flat(found: Sensitivity) -> bool:
-    """Whether the residual is orthogonal to its derivatives, to what rounding allows."""
-    r = np.asarray(found.residual).reshape(-1)
-    j = np.asarray(found.jacobian).reshape(len(r), -1)
-    size = np.linalg.norm(j, axis=0) * np.linalg.norm(r)
-    return bool(np.all(np.abs(j.T @ r) <= 1e-5 * np.where(size > 0, size, 1.0)))
+    theta = jnp.clip(theta, problem.lower, problem.upper)
+    point = linearise(problem, theta, start)
+    if not np.isfinite(point.loss):
+        return Minimum(point, Status.diverged, 1)
+    count = point.found.residual.size
+    scales, damping, growth = _Scales.of(point), 1e-3, 2.0
+    losses = [float(point.loss)]
+    for k in range(2, max_steps + 1):
+        # What a full step promises, in units of the residual's own spread.
+        if _step(problem, point, scales, 1e-10)[2] <= tolerance**2 * float(point.loss) / count:
+            return Minimum(point, Status.converged, k - 1)
+        step, start_step, gain = _step(problem, point, scales, damping)
+        trial = linearise(problem, point.theta + step, point.start + start_step)
+        say(f"iteration {k}, weighted squared error {float(trial.loss):.6g}")
+        share = (float(point.loss) - float(trial.loss)) / gain
+        if share > 0:
+            point, scales = trial, _Scales.of(trial, scales)
+            losses.append(float(point.loss))
+            damping, growth = max(damping * max(1 / 3, 1 - (2 * share - 1) ** 3), 1e-10), 2.0
+        else:
+            damping, growth = damping * growth, 2 * growth
+        # Where friction sticks, the loss has kinks, and full steps keep promising what small ones
+        # do not find: what five of them no longer change is where the model is at its best.
+        if len(losses) > 5 and losses[-6] - losses[-1] < worth * losses[-1]:
+            return Minimum(point, Status.converged, k)
+        if damping > 1e12:
+            return Minimum(point, Status.stalled, k)
+    return Minimum(point, Status.max_steps, max_steps)

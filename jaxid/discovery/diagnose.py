@@ -1,0 +1,481 @@
+"""Every effect of the catalogue held against the residual of one fit, without a refit."""
+
+import html
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
+from jaxtyping import Float
+
+from .. import figures
+from ..effects import AbstractEffect, Curve, Scene
+from ..effects import catalogue as known
+from ..errors import FitError, ModelError
+from ..estimate import OEM, Fit
+from ..estimate.oem import _free_starts, _signals, pieces_of
+from ..loop import ClosedLoop
+from ..noise import ARFilter
+from ..parameters import write_values
+from ..progress import working
+from ..recording import Recordings
+from ..simulate import Batch, prepare, with_substeps
+from .linear import Linearised, base_columns, linearise
+from .score import (
+    Data,
+    Gram,
+    chance,
+    corrected,
+    effective_tests,
+    estimate_noise,
+    gram_of,
+    leftover,
+)
+from .signatures import Hypothesis, amplitudes, candidates, curves, signatures, survey
+
+
+class Verdict(eqx.Module):
+    """What one hypothesis, at its best setting, explains.
+
+    `evidence` is the whitened squared error it takes away, less log(samples) for each amplitude
+    (twice the logarithm of odds, as BIC has it); `p_value` is corrected for all that was asked.
+    """
+
+    hypothesis: Hypothesis
+    evidence: float
+    explained: float
+    freedom: int
+    p_value: float
+    possible: bool
+
+    @property
+    def key(self) -> tuple[str, int | None]:
+        """Effect and joint."""
+        return self.hypothesis.name, self.hypothesis.joint
+
+
+class Diagnosis(eqx.Module):
+    """Where a fitted model fails and which effects may be missing, ranked.
+
+    - `ranking`: the catalogue's entries, each at its best setting, best first.
+    - `where`: free-form curves of every coordinate, best first.
+    - `noise`: the noise filter of each output.
+    """
+
+    fit: Fit
+    ranking: tuple[Verdict, ...]
+    where: tuple[Verdict, ...]
+    noise: tuple[ARFilter, ...]
+    data: Data
+    gram: Gram
+    scene: Scene
+    floor: Float[np.ndarray, "recordings joints"]
+    tests: float
+    significance: float = 0.01
+
+    @property
+    def best(self) -> AbstractEffect:
+        """The leading effect of the catalogue at its predicted amplitude, ready to be added.
+
+        **Raises:** `FitError` where nothing of the catalogue can be added.
+        """
+        for verdict in self.ranking:
+            if verdict.possible:
+                return self.predicted(verdict)
+        raise FitError(
+            "no effect of the catalogue explains anything of the residual: there is nothing to add"
+        )
+
+    @property
+    def adequate(self) -> bool:
+        """Whether nothing significant is left, neither for the catalogue nor for a curve."""
+        return all(v.p_value > self.significance for v in (*self.ranking[:1], *self.where[:1]))
+
+    def predicted(self, verdict: Verdict) -> AbstractEffect:
+        """An effect with the amplitudes that its signature predicts."""
+        effect, columns = verdict.hypothesis.effect, verdict.hypothesis.columns
+        linear = amplitudes(effect)
+        values, _ = self.gram.amplitude(columns)
+        if not linear:
+            return effect.scaled(float(np.clip(values[0], 0.05, 20.0)))
+        return write_values(effect, linear, jnp.asarray(values))
+
+    def amplitude(self, verdict: Verdict) -> tuple[np.ndarray, np.ndarray]:
+        """Predicted amplitudes and their deviations, in the units of the effect's parameters."""
+        values, covariance = self.gram.amplitude(verdict.hypothesis.columns)
+        return values, np.sqrt(np.diag(covariance))
+
+    def predicted_error(self, verdict: Verdict) -> Float[np.ndarray, " joints"]:
+        """Relative error over all fitted recordings that adding the effect would leave, %."""
+        rest = leftover(self.data, self.noise, verdict.hypothesis.columns, 1e-9)
+        return 100 * np.sqrt(np.sum(rest**2, axis=(0, 1))) / self._measured()
+
+    def _measured(self) -> Float[np.ndarray, " joints"]:
+        error = np.sqrt(np.sum(self.data.residual**2, axis=(0, 1)))
+        return error / (total_percent(self.fit) / 100)
+
+    def correlation(self, one: Verdict, other: Verdict) -> float:
+        """Largest correlation of two effects' signatures, what the model absorbs taken off."""
+        a, b = list(one.hypothesis.columns), list(other.hypothesis.columns)
+        g = self.gram.gram
+        left = np.linalg.cholesky(g[np.ix_(a, a)] + 1e-9 * np.eye(len(a)))
+        right = np.linalg.cholesky(g[np.ix_(b, b)] + 1e-9 * np.eye(len(b)))
+        across = np.linalg.solve(left, np.linalg.solve(right, g[np.ix_(b, a)]).T)
+        return float(min(1.0, np.linalg.svd(across, compute_uv=False)[0]))
+
+    def alike(self, verdict: Verdict, within: float = 10.0) -> tuple[Verdict, ...]:
+        """Effects that these recordings can hardly tell apart from one.
+
+        Their evidence is within `within` of its own, and their signatures correlate above 0.9.
+        """
+        return tuple(
+            other
+            for other in self.ranking
+            if other.key != verdict.key
+            and other.evidence > verdict.evidence - within
+            and self.correlation(verdict, other) > 0.9
+        )
+
+    def table(self) -> pd.DataFrame:
+        """The ranking: what each explains, corrected p-value, amplitude, predicted error."""
+        rows = []
+        total = self.gram.rest
+        for verdict in self.ranking:
+            values, stds = self.amplitude(verdict)
+            symbols = [n for p in amplitudes(verdict.hypothesis.effect) for n in p.names]
+            symbols = symbols or ["setting"]
+            size = ", ".join(
+                f"{s} {v:.3g} ± {d:.1g}" for s, v, d in zip(symbols, values, stds, strict=True)
+            )
+            error = self.predicted_error(verdict) if verdict.p_value < 0.05 else None
+            rows.append(
+                {
+                    "effect": verdict.hypothesis.name,
+                    "joint": "all"
+                    if verdict.hypothesis.joint is None
+                    else verdict.hypothesis.joint,
+                    "p_value": verdict.p_value,
+                    "explained_percent": 100 * verdict.explained / total if total else 0.0,
+                    "evidence": verdict.evidence,
+                    "amplitude": size,
+                    "predicted_error_percent": None
+                    if error is None
+                    else ", ".join(f"{x:.2f}" for x in error),
+                    "possible": verdict.possible,
+                }
+            )
+        return pd.DataFrame(rows)
+
+    def where_table(self) -> pd.DataFrame:
+        """Where the model fails: on which coordinate which joint's torque depends, best first."""
+        total = self.gram.rest
+        return pd.DataFrame(
+            [
+                {
+                    "coordinate": verdict.hypothesis.effect.label,  # type: ignore[attr-defined]
+                    "times_sign_of_v": verdict.hypothesis.effect.signed,  # type: ignore[attr-defined]
+                    "joint": verdict.hypothesis.joint,
+                    "p_value": verdict.p_value,
+                    "explained_percent": 100 * verdict.explained / total if total else 0.0,
+                }
+                for verdict in self.where
+            ]
+        )
+
+    def plot(self) -> go.Figure:
+        """The leading entries of the ranking by what they explain."""
+        top = self.ranking[:12]
+        labels = [_label(v) for v in top]
+        shares = np.array([100 * v.explained / self.gram.rest for v in top])
+        return figures.ranking(
+            labels, shares, np.array([v.p_value < self.significance for v in top])
+        )
+
+    def plot_shares(self, recording: int = 0, joint: int = 1, contenders: int = 4) -> go.Figure:
+        """What each contender predicts of one joint's residual in time.
+
+        **Arguments:**
+
+        - `recording`: number from 0. `joint`: counted from 1. `contenders`: how many.
+        """
+        keep = self.data.mask[recording]
+        shares = {}
+        for verdict in self.ranking[:contenders]:
+            columns = list(verdict.hypothesis.columns)
+            values, _ = self.gram.amplitude(columns)
+            shares[_label(verdict)] = (
+                self.data.table[recording, :, joint - 1, columns].T @ values
+            )[keep]
+        record = self.fit.recordings[recording]
+        residual = self.data.residual[recording, keep, joint - 1]
+        time = record.time if len(record.time) == len(residual) else np.arange(len(residual)) * 1.0
+        unit = self.fit.loop.arm.units()[0][joint - 1]
+        return figures.shares_in_time(time, residual, shares, unit=unit)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The ranking and where the model fails, as plain JSON."""
+        return {
+            "robot": self.fit.loop.name,
+            "ranking": [
+                {
+                    "effect": v.hypothesis.name,
+                    "joint": v.hypothesis.joint,
+                    "p_value": v.p_value,
+                    "predicted_error_percent": self.predicted_error(v).tolist(),
+                }
+                for v in self.ranking
+            ],
+            "depends_on": self.depends_on(),
+            "noise_floor_percent": self.floor_percent().tolist(),
+        }
+
+    def depends_on(self) -> list[dict[str, Any]]:
+        """Coordinates on which a significant part of the residual depends, best first."""
+        return [
+            {
+                "coordinate": v.hypothesis.effect.label,  # type: ignore[attr-defined]
+                "joint": v.hypothesis.joint,
+                "p_value": v.p_value,
+            }
+            for v in self.where
+            if v.p_value < self.significance
+        ]
+
+    def floor_percent(self) -> Float[np.ndarray, " joints"]:
+        """Relative error that a perfect model would leave on the fitted recordings, %."""
+        return np.sqrt(np.mean(self.floor**2, axis=0))
+
+    def __repr__(self) -> str:
+        table = self.table().head(12)
+        state = "nothing significant is missing" if self.adequate else "something is missing"
+        return (
+            f"{self.fit.loop.name}: {state}; noise floor "
+            f"{', '.join(f'{x:.2f}' for x in self.floor_percent())} %\n"
+            f"{table.to_string(index=False, float_format=lambda x: f'{x:.3g}')}"
+        )
+
+    def _repr_html_(self) -> str:
+        head = html.escape(repr(self).split("\n")[0])
+        return f"<p>{head}</p>{self.table().to_html(index=False, float_format='%.3g')}"
+
+
+def _label(verdict: Verdict) -> str:
+    joint = verdict.hypothesis.joint
+    return verdict.hypothesis.name + ("" if joint is None else f", joint {joint}")
+
+
+def total_percent(fit: Fit) -> Float[np.ndarray, " joints"]:
+    """Relative error of a fit over all its recordings together, %."""
+    table = fit.error_percent.to_numpy()
+    error = np.stack([np.linalg.norm(r, axis=0) for r in fit.residuals])
+    size = 100 * error / np.where(table > 0, table, np.inf)
+    return 100 * np.sqrt((error**2).sum(axis=0)) / np.sqrt((size**2).sum(axis=0))
+
+
+def diagnose(
+    fit: Fit,
+    *,
+    catalogue: Sequence[Any] = known,
+    significance: float = 0.01,
+    progress: bool = True,
+) -> Diagnosis:
+    """Screens every effect of a catalogue, on all joints, at all settings, from one fit.
+
+    Exact sensitivities make it cheap: the closed loop is linearised along its runs, and every
+    hypothesis is the response of that linear system to its torque.
+
+    **Arguments:**
+
+    - `fit`: of a loop that is simulated (by `OEM`, `DIDIM` or `IDIM`).
+    - `catalogue`: effect classes, effects, or functions from a `Scene` to effects; for instance
+      `(*jaxid.catalogue, Mine)`.
+    - `significance`: corrected p-value below which something counts as missing.
+
+    **Raises:** `FitError` where the fitted loop cannot be simulated.
+    """
+    with working(f"diagnosis of {fit.loop.name}", progress) as say:
+        loop = with_substeps(fit.loop, fit.recordings)
+        output, batch, free = _as_fitted(fit, loop)
+        say("linearising along the recordings")
+        linear = linearise(loop, batch, output)
+        residual, base = _residual_and_base(batch, linear, loop, output, free)
+        if not np.isfinite(residual).all() or not np.isfinite(base).all():
+            raise FitError(
+                f"{loop.name} cannot be simulated at its fitted values, so nothing can be held "
+                "against its residual: fit it by OEM first"
+            )
+        tones, trials = _tones(residual, np.asarray(batch.kept), fit.recordings)
+        scene = survey(loop, fit.recordings, linear.motion, tones)
+        proposed = candidates(catalogue, scene, trials)
+        proposed += [(curve, 1.0) for curve in curves(scene, linear.motion)]
+        row = {"tau": 0, "q": 1}[output]
+        hypotheses, table = signatures(loop, batch, linear, proposed, row, say)
+        data = Data(residual, base, _at_samples(batch, table), np.asarray(batch.kept))
+        say(f"scoring {len(hypotheses)} hypotheses")
+        return _judge(fit, data, hypotheses, scene, significance)
+
+
+def _as_fitted(fit: Fit, loop: ClosedLoop) -> tuple[str, Batch, np.ndarray]:
+    """Which output is compared, the batch, and which initial states are free, as in the fit."""
+    method = fit.method if isinstance(fit.method, OEM) else OEM()
+    pieces = pieces_of(fit.recordings, method.window)
+    batch = prepare(loop, pieces)
+    return _signals(method, loop)[0], batch, _free_starts(method, pieces, batch)
+
+
+def _at_samples(batch: Batch, x: Float[np.ndarray, "recordings points *axes"]) -> np.ndarray:
+    """Rows at the samples, in the band that is compared, zero where there is no sample."""
+    if batch.at is not None:
+        x = np.stack([row[at] for row, at in zip(x, np.asarray(batch.at), strict=True)])
+    mask = np.asarray(batch.mask).reshape(*batch.mask.shape, *(1,) * (x.ndim - 2))
+    x = x * mask
+    return x if batch.band is None else np.asarray(batch.band(jnp.asarray(x)))
+
+
+def _residual_and_base(
+    batch: Batch, linear: Linearised, loop: ClosedLoop, output: str, free: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    seen = np.asarray(linear.seen[:, :, {"tau": 0, "q": 1}[output]])
+    if batch.at is not None:
+        seen = np.stack([row[at] for row, at in zip(seen, np.asarray(batch.at), strict=True)])
+    residual = (np.asarray(getattr(batch, output)) - seen) * np.asarray(batch.mask)[..., None]
+    if batch.band is not None:
+        residual = np.asarray(batch.band(jnp.asarray(residual)))
+    p = loop.theta.shape[0]
+    base = _at_samples(batch, np.asarray(base_columns(linear, p, bool(free.any()))))
+    if not free.any():
+        return residual, base
+    shared, own = base[..., :p], base[..., p:]
+    blocks = [shared]
+    for k in np.flatnonzero(free):
+        alone = np.zeros_like(own)
+        alone[k] = own[k]
+        blocks.append(alone)
+    return residual, np.concatenate(blocks, axis=-1)
+
+
+def _tones(
+    residual: np.ndarray, mask: np.ndarray, recordings: Recordings, most: int = 4
+) -> tuple[list[list[float]], float]:
+    """Frequencies that stand out of each joint's spectrum, and how many they were picked from."""
+    period = float(np.median([r.period for r in recordings]))
+    n = residual.shape[1]
+    f = np.fft.rfftfreq(4 * n, period)
+    usable = (f > 2 / (n * period)) & (f < 0.4 / period)
+    found = []
+    for j in range(residual.shape[2]):
+        power = np.zeros(len(f))
+        for row, there in zip(residual[..., j], mask, strict=True):
+            window = np.zeros(n)
+            window[there] = np.hanning(int(there.sum()))
+            power += np.abs(np.fft.rfft(row * window, 4 * n)) ** 2
+        # Against the level around it, so that coloured noise does not take every place.
+        width = max(9, n // 20)
+        around = np.exp(np.convolve(np.log(power + 1e-300), np.ones(width) / width, mode="same"))
+        stands = np.where(usable, power / around, 0.0)
+        row = []
+        for _ in range(most):
+            k = int(stands.argmax())
+            row.append(float(f[k]))
+            stands[np.abs(f - f[k]) < 2 / (n * period)] = 0.0
+        found.append(row)
+    return found, float(usable.sum() / 4 * residual.shape[2])
+
+
+def _judge(
+    fit: Fit,
+    data: Data,
+    hypotheses: list[Hypothesis],
+    scene: Scene,
+    significance: float,
+) -> Diagnosis:
+    blocks = [h.columns for h in hypotheses]
+    noise, picked = estimate_noise(data, blocks)
+    gram = gram_of(data, noise)
+    tests = effective_tests(gram, blocks)
+    ranking: dict[tuple[str, int | None], Verdict] = {}
+    where: dict[tuple[Any, ...], Verdict] = {}
+    for hypothesis in hypotheses:
+        verdict = _verdict(gram, hypothesis, tests)
+        effect = hypothesis.effect
+        if isinstance(effect, Curve):
+            where[(effect.label, effect.joint, effect.signed)] = verdict
+            continue
+        before = ranking.get(verdict.key)
+        if before is None or (verdict.possible, verdict.evidence) > (
+            before.possible,
+            before.evidence,
+        ):
+            ranking[verdict.key] = verdict
+    columns = [c for k in picked for c in blocks[k]]
+    return Diagnosis(
+        fit,
+        tuple(sorted(ranking.values(), key=_order, reverse=True)),
+        tuple(sorted(where.values(), key=_order, reverse=True)),
+        noise,
+        data,
+        gram,
+        scene,
+        _floor(fit, data, leftover(data, noise, columns, 1e-9), len(columns)),
+        tests,
+        significance,
+    )
+
+
+def _order(verdict: Verdict) -> float:
+    return verdict.evidence
+
+
+def _verdict(gram: Gram, hypothesis: Hypothesis, tests: float) -> Verdict:
+    explained, freedom = gram.explained(hypothesis.columns)
+    p = corrected(min(1.0, chance(explained, freedom) * hypothesis.tests), tests)
+    price = freedom * np.log(gram.count) + 2 * np.log(hypothesis.tests)
+    possible = freedom > 0 and _within_bounds(gram, hypothesis)
+    return Verdict(hypothesis, explained - float(price), explained, freedom, p, possible)
+
+
+def _within_bounds(gram: Gram, hypothesis: Hypothesis) -> bool:
+    """Whether the predicted amplitudes are physical (a drag that pushes is not)."""
+    linear = amplitudes(hypothesis.effect)
+    values, _ = gram.amplitude(hypothesis.columns)
+    if not linear:
+        return bool(values[0] > 0)
+    lower = np.concatenate([np.full(p.size, p.declaration.lower) for p in linear])
+    upper = np.concatenate([np.full(p.size, p.declaration.upper) for p in linear])
+    return bool(np.all((values > lower) & (values < upper)))
+
+
+def _floor(
+    fit: Fit, data: Data, rest: np.ndarray, lost: int
+) -> Float[np.ndarray, "recordings joints"]:
+    """Relative error by recording and joint of noise alone, what the model took of it put back."""
+    outputs = data.residual.shape[2]
+    freedom = 1 - (data.base.shape[-1] + lost) / (data.mask.sum() * outputs)
+    if len(data.residual) != len(fit.residuals):
+        level = np.sqrt(np.sum(rest**2, axis=(0, 1)) / np.sum(data.residual**2, axis=(0, 1)))
+        return fit.error_percent.to_numpy() * level
+    error = np.sqrt(np.sum(rest**2, axis=1))
+    size = np.sqrt(np.sum(data.residual**2, axis=1))
+    return fit.error_percent.to_numpy() * error / size / np.sqrt(max(freedom, 0.1))
+
+
+def effect_parameters(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[int, str, str]]:
+    """Where an effect's free values stand in `loop.theta`: place, name in the effect, unit.
+
+    **Raises:** `ModelError` where the loop does not have the effect.
+    """
+    position = next((k for k, e in enumerate(loop.effects) if e is effect), None)
+    if position is None:
+        raise ModelError(f"{effect.effect_name()} is not one of the loop's effects: add it first")
+    found, place = [], 0
+    for p in loop.free_parameters:
+        steps = p.where.steps  # type: ignore[attr-defined]
+        if steps[:2] == ("effects", position):
+            for k in range(p.size):
+                name = steps[-1] if not p.several else f"{steps[-1]}[{k + 1}]"
+                found.append((place + k, str(name), loop.unit(p)))
+        place += p.size
+    return found

@@ -1,0 +1,580 @@
+"""The loop of diagnose, add, refit, until nothing significant is left."""
+
+import dataclasses
+import html
+import json
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
+from jaxtyping import Float
+from scipy import stats
+
+from .. import figures
+from ..effects import AbstractEffect, Curve
+from ..effects import catalogue as known
+from ..errors import ModelError
+from ..estimate import OEM, Fit, fit
+from ..loop import ClosedLoop
+from ..noise import ARFilter
+from ..parameters import Bounds, list_parameters, read_values, write_values
+from ..progress import working
+from ..recording import Recording, Recordings
+from ..simulate import compared
+from .compare import Comparison, compare
+from .diagnose import Diagnosis, Verdict, diagnose, effect_parameters
+from .score import whitened
+
+Outcome = Literal["adequate", "explained", "outside_catalogue"]
+
+
+class Contender(eqx.Module):
+    """One effect, added and refitted, with how well it does."""
+
+    name: str
+    joint: int | None
+    fit: Fit
+    criterion: float
+
+
+class Step(eqx.Module):
+    """One turn of the loop: the model so far, and what was found in it.
+
+    `added` is the effect that this step's model has over the last one's; `alike` what these
+    recordings cannot tell from it; `contenders` all that were refitted.
+    """
+
+    label: str
+    fit: Fit
+    held_out: Comparison | None
+    diagnosis: Diagnosis
+    added: AbstractEffect | None = None
+    alike: tuple[tuple[str, int | None], ...] = ()
+    contenders: tuple[Contender, ...] = ()
+
+
+class Discovery(eqx.Module):
+    """The story: what the model lacked, step by step, and where it stopped.
+
+    - `verdict`: `"adequate"`, `"explained"` or `"outside_catalogue"`.
+    - `steps`: the first is the starting model.
+    - `removed`: effects that were added and later found not to be needed.
+    """
+
+    verdict: Outcome = eqx.field(static=True)
+    steps: tuple[Step, ...]
+    removed: tuple[tuple[str, int | None], ...] = ()
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    seconds: float = eqx.field(static=True, default=0.0)
+
+    @property
+    def fit(self) -> Fit:
+        """The last fit."""
+        return self.steps[-1].fit
+
+    @property
+    def loop(self) -> ClosedLoop:
+        """The model at the end."""
+        return self.fit.loop
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """The diagnosis of the model at the end."""
+        return self.steps[-1].diagnosis
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in a sentence for a colleague."""
+        added = [_called(step) for step in self.steps if step.added is not None]
+        if self.verdict == "adequate":
+            return (
+                f"The model of {self.loop.name} describes these recordings down to their noise: "
+                "nothing is missing."
+            )
+        if self.verdict == "explained":
+            return f"The model lacked {' and '.join(added)}; with that, nothing is left to explain."
+        where = self.diagnosis.depends_on()
+        first = where[0] if where else {"coordinate": "?", "joint": "?"}
+        after = f" after adding {' and '.join(added)}" if added else ""
+        return (
+            f"Something is left{after} that no effect of the catalogue explains: the torque of "
+            f"joint {first['joint']} depends on {first['coordinate']} in a way the model lacks."
+        )
+
+    def table(self) -> pd.DataFrame:
+        """Error by step and joint, on fitted and held-out recordings, %."""
+        rows = []
+        for step in self.steps:
+            row: dict[str, Any] = {"step": step.label}
+            for j, x in enumerate(_rms(step.fit.error_percent), start=1):
+                row[f"fit, joint {j}"] = x
+            if step.held_out is not None:
+                for j, x in enumerate(_rms(step.held_out.error_percent), start=1):
+                    row[f"held out, joint {j}"] = x
+            rows.append(row)
+        return pd.DataFrame(rows).set_index("step")
+
+    def plot(self) -> go.Figure:
+        """The error falling, step by step, with the noise floor."""
+        series = {"fitted": np.stack([_rms(s.fit.error_percent) for s in self.steps])}
+        if all(s.held_out is not None for s in self.steps):
+            series["held out"] = np.stack(
+                [_rms(s.held_out.error_percent) for s in self.steps if s.held_out is not None]
+            )
+        labels = [step.label for step in self.steps]
+        return figures.error_falling(labels, series, self.noise_floor_percent())
+
+    def noise_floor_percent(self) -> Float[np.ndarray, " joints"]:
+        """Relative error that a perfect model would leave on the fitted recordings, %."""
+        return self.diagnosis.floor_percent()
+
+    def suggestion(self) -> Curve:
+        """The free-form curve that explains most of what is left, ready to be added.
+
+        **Raises:** `ModelError` where nothing is left.
+        """
+        if not self.diagnosis.depends_on():
+            raise ModelError("nothing significant is left, so there is no curve to suggest")
+        curve = self.diagnosis.predicted(self.diagnosis.where[0])
+        assert isinstance(curve, Curve)
+        return curve
+
+    def to_dict(self) -> dict[str, Any]:
+        """The story as plain JSON, as `jaxid discover --json` writes it."""
+        first, last = self.steps[0], self.steps[-1]
+        outside = self.verdict == "outside_catalogue"
+        return {
+            "robot": self.loop.name,
+            "verdict": self.verdict,
+            "ranking": first.diagnosis.to_dict()["ranking"],
+            "added": [
+                {
+                    "effect": step.added.effect_name(),
+                    "joint": getattr(step.added, "joint", None),
+                    "parameters": _found_parameters(self.steps, k),
+                    "indistinguishable": [{"effect": n, "joint": j} for n, j in step.alike],
+                }
+                for k, step in enumerate(s for s in self.steps if s.added is not None)
+                if step.added is not None
+            ],
+            "depends_on": last.diagnosis.depends_on() if outside else [],
+            "error_percent": {"before": _errors(first), "after": _errors(last)},
+            "noise_floor_percent": self.noise_floor_percent().tolist(),
+            "sentence": self.sentence,
+            "removed": [{"effect": n, "joint": j} for n, j in self.removed],
+            "notes": list(self.notes),
+            "seconds": self.seconds,
+        }
+
+    def __repr__(self) -> str:
+        lines = [f"{self.verdict}: {self.sentence}", "relative error, %:"]
+        lines.append(self.table().to_string(float_format=lambda x: f"{x:.3f}"))
+        floor = ", ".join(f"{x:.3f}" for x in self.noise_floor_percent())
+        lines.append(f"noise floor, %: {floor}")
+        for k, step in enumerate(s for s in self.steps if s.added is not None):
+            values = _found_parameters(self.steps, k)
+            shown = ", ".join(
+                f"{n} {p['value']:.4g}"
+                + (f" ± {p['std']:.2g}" if p["std"] is not None else "")
+                + f" {p['unit']}"
+                for n, p in values.items()
+            )
+            lines.append(f"{_called(step)}: {shown}")
+            if step.alike:
+                others = ", ".join(_name(n, j) for n, j in step.alike)
+                lines.append(f"  these recordings cannot tell it from {others}")
+        return "\n".join([*lines, *self.notes])
+
+    def _repr_html_(self) -> str:
+        body = html.escape(repr(self).split("\n", 1)[1])
+        return f"<p><b>{html.escape(self.sentence)}</b></p><pre>{body}</pre>"
+
+
+def _name(name: str, joint: int | None) -> str:
+    return name + ("" if joint is None else f" on joint {joint}")
+
+
+def _called(step: Step) -> str:
+    assert step.added is not None
+    return _name(step.added.effect_name(), getattr(step.added, "joint", None))
+
+
+def _rms(table: pd.DataFrame) -> Float[np.ndarray, " joints"]:
+    return np.sqrt(np.mean(table.to_numpy() ** 2, axis=0))
+
+
+def _errors(step: Step) -> dict[str, list[float]]:
+    errors = {"fit": _rms(step.fit.error_percent).tolist()}
+    if step.held_out is not None:
+        errors["validate"] = _rms(step.held_out.error_percent).tolist()
+    return errors
+
+
+def _found_parameters(steps: Sequence[Step], added: int) -> dict[str, dict[str, Any]]:
+    """Values of the added-th added effect in the last fit; added effects stand last in the loop."""
+    fit = steps[-1].fit
+    total = sum(step.added is not None for step in steps)
+    effect = fit.loop.effects[len(fit.loop.effects) - total + added]
+    std = fit.std
+    return {
+        name: {
+            "value": float(fit.theta[place]),
+            "std": float(std[place]) if np.isfinite(std[place]) else None,
+            "unit": unit,
+        }
+        for place, name, unit in effect_parameters(fit.loop, effect)
+    }
+
+
+def discover(
+    loop: ClosedLoop,
+    recordings: Recording | Recordings | Iterable[Recording],
+    validate: Recording | Recordings | Iterable[Recording] | None = None,
+    *,
+    catalogue: Sequence[Any] = known,
+    method: OEM | None = None,
+    significance: float = 0.01,
+    most: int = 6,
+    resume: str | Path | None = None,
+    progress: bool = True,
+) -> Discovery:
+    """Finds what the model lacks: diagnose, add, refit, until nothing significant is left.
+
+    Then each added effect is tried without.
+
+    **Arguments:**
+
+    - `loop`: the starting model.
+    - `recordings`: to fit. `validate`: held out, to judge by.
+    - `catalogue`: as for `diagnose`.
+    - `method`: of the fits.
+    - `significance`: corrected p-value below which something counts as missing.
+    - `most`: how many effects to add at the most.
+    - `resume`: a file in which every step is saved as it ends, and from which it goes on.
+
+    **Raises:** `FitError`, `ModelError`, `RecordingError` where model and recordings do not fit.
+    """
+    started = time.perf_counter()
+    recordings = Recordings.of(recordings)
+    held_out = None if validate is None else Recordings.of(validate)
+    search = _Search(
+        recordings, held_out, tuple(catalogue), method or OEM(), significance, progress
+    )
+    with working(f"discovery on {loop.name}", progress) as say:
+        journal = _Journal(None if resume is None else Path(resume), loop, recordings)
+        steps = journal.replay(search, loop, say)
+        verdict: Outcome | None = None
+        while verdict is None:
+            verdict, step = search.turn(steps, most, say)
+            if step is not None:
+                steps.append(step)
+                journal.save(steps)
+        steps, removed = search.prune(steps, say)
+    notes = _notes(steps, most)
+    return Discovery(verdict, tuple(steps), removed, notes, time.perf_counter() - started)
+
+
+def _notes(steps: Sequence[Step], most: int) -> tuple[str, ...]:
+    notes = []
+    if len(steps) > most:
+        notes.append(f"stopped after {most} effects, although something may be left: raise most")
+    bad = [s.label for s in steps if not s.fit.succeeded]
+    if bad:
+        notes.append(f"the fit of {', '.join(bad)} did not converge: read its values with care")
+    return tuple(notes)
+
+
+class _Search(eqx.Module):
+    """What stays the same over the turns of a discovery."""
+
+    recordings: Recordings
+    held_out: Recordings | None
+    catalogue: tuple[Any, ...]
+    method: OEM
+    significance: float
+    progress: bool
+
+    def begin(self, loop: ClosedLoop, say: Callable[[str], None]) -> Step:
+        """The starting model, fitted and diagnosed."""
+        say("fit of the starting model")
+        first = fit(loop, self.recordings, _quiet(self.method))
+        say("diagnosis of the starting model")
+        return self.step("start", first)
+
+    def step(self, label: str, found: Fit, **extra: Any) -> Step:
+        """A step with its diagnosis and its error on held-out recordings."""
+        diagnosis = diagnose(
+            found, catalogue=self.catalogue, significance=self.significance, progress=False
+        )
+        held = None if self.held_out is None else compare(found, self.held_out)
+        return Step(label, found, held, diagnosis, **extra)
+
+    def turn(
+        self, steps: list[Step], most: int, say: Callable[[str], None]
+    ) -> tuple[Outcome | None, Step | None]:
+        """One turn: a verdict, or the next step."""
+        last = steps[-1]
+        done = "explained" if last.added is not None else "adequate"
+        diagnosis = last.diagnosis
+        if diagnosis.adequate:
+            return done, None
+        entries = [
+            v
+            for v in diagnosis.ranking
+            if v.possible and v.p_value < self.significance and v.evidence > 0
+        ]
+        if not entries or len(steps) > most:
+            return "outside_catalogue", None
+        contenders = self.refit(last, _leading(entries), say)
+        best = contenders[0] if contenders else None
+        if best is None or best.criterion >= self.criterion(last.fit, diagnosis.noise):
+            return "outside_catalogue", None
+        gained = self.criterion(last.fit, diagnosis.noise) - best.criterion
+        if _curve_is_better(diagnosis, gained):
+            return "outside_catalogue", None
+        say(f"diagnosis with {_name(best.name, best.joint)}")
+        step = self.step(
+            f"+ {_name(best.name, best.joint)}",
+            best.fit,
+            added=best.fit.loop.effects[-1],
+            alike=_alike(diagnosis, best, contenders),
+            contenders=tuple(contenders),
+        )
+        return None, step
+
+    def refit(
+        self, last: Step, leading: Sequence[Verdict], say: Callable[[str], None]
+    ) -> list[Contender]:
+        """The leading entries as full nonlinear models, best first."""
+        found = []
+        for verdict in leading:
+            say(f"refit with {_name(*verdict.key)}")
+            loop = last.fit.loop.add(_inside(last.diagnosis.predicted(verdict)))
+            method = dataclasses.replace(_quiet(self.method), start="given")
+            refitted = fit(loop, self.recordings, method)
+            value = self.criterion(refitted, last.diagnosis.noise)
+            if np.isfinite(value):
+                found.append(Contender(*verdict.key, refitted, value))
+        return sorted(found, key=lambda c: c.criterion)
+
+    def criterion(self, found: Fit, noise: Sequence[ARFilter]) -> float:
+        """Whitened squared error on fitted and held-out recordings, and BIC's price.
+
+        Less is better; a difference of ten is decisive.
+        """
+        total = _whitened_error(found.residuals, noise)
+        count = sum(r.size for r in found.residuals)
+        if self.held_out is not None:
+            try:
+                total += _whitened_error(_held_residuals(found, self.held_out), noise)
+            except (ArithmeticError, ValueError, RuntimeError):
+                return np.inf
+        return total + len(found.names) * float(np.log(count))
+
+    def prune(
+        self, steps: list[Step], say: Callable[[str], None]
+    ) -> tuple[list[Step], tuple[tuple[str, int | None], ...]]:
+        """Takes out effects that the others have made superfluous."""
+        removed: list[tuple[str, int | None]] = []
+        while True:
+            added = [k for k, s in enumerate(steps) if s.added is not None]
+            if len(added) < 2:
+                return steps, tuple(removed)
+            weakest, p = min(
+                ((k, _need(steps[-1], k, added)) for k in added[:-1]), key=lambda x: -x[1]
+            )
+            if p < self.significance:
+                return steps, tuple(removed)
+            gone = steps[weakest]
+            say(f"again without {_called(gone)}")
+            position = len(steps[-1].fit.loop.effects) - len(added) + added.index(weakest)
+            loop = steps[-1].fit.loop
+            kept = loop.effects[:position] + loop.effects[position + 1 :]
+            found = fit(
+                dataclasses.replace(loop, effects=kept),
+                self.recordings,
+                dataclasses.replace(_quiet(self.method), start="given"),
+            )
+            assert gone.added is not None
+            removed.append((gone.added.effect_name(), getattr(gone.added, "joint", None)))
+            final = steps[-1]
+            again = self.step(
+                final.label, found, added=final.added, alike=final.alike, contenders=()
+            )
+            steps = [s for k, s in enumerate(steps[:-1]) if k != weakest] + [again]
+
+
+def _quiet(method: OEM) -> OEM:
+    return dataclasses.replace(method, progress=False)
+
+
+def _leading(entries: Sequence[Verdict]) -> list[Verdict]:
+    """The entries whose evidence is close to the best's, three at the most.
+
+    Signatures are exact to first order only: five per cent of the best is within what the
+    nonlinear models may still turn round.
+    """
+    best = entries[0].evidence
+    close = [v for v in entries if v.evidence > best - max(30.0, 0.05 * best)]
+    return close[:3]
+
+
+def _inside(effect: AbstractEffect) -> AbstractEffect:
+    """The effect with its parameters moved just inside their bounds."""
+    chosen = [p for p in list_parameters(effect) if p.declaration.free]
+    if not chosen:
+        return effect
+    bounds = Bounds.of(chosen)
+    values = bounds.inside(bounds.outside(read_values(effect, chosen)))
+    return write_values(effect, chosen, jnp.asarray(values))
+
+
+def _curve_is_better(diagnosis: Diagnosis, gained: float) -> bool:
+    """Whether a free-form curve explains clearly more than the refitted effect has gained.
+
+    A curve spends a dozen coefficients on what an effect of the catalogue, if it is the true one,
+    says with one to four; evidence has that price in it.
+    """
+    if not diagnosis.where:
+        return False
+    curve = diagnosis.where[0].evidence
+    return curve - gained > max(30.0, 0.1 * curve)
+
+
+def _alike(
+    diagnosis: Diagnosis, best: Contender, contenders: Sequence[Contender]
+) -> tuple[tuple[str, int | None], ...]:
+    """What cannot be told from the chosen effect: refitted rivals, then signatures."""
+    chosen = next(v for v in diagnosis.ranking if v.key == (best.name, best.joint))
+    refitted = {(c.name, c.joint): c.criterion for c in contenders}
+    near = [
+        key
+        for key, value in refitted.items()
+        if value < best.criterion + 10.0 and key != chosen.key
+    ]
+    near += [v.key for v in diagnosis.alike(chosen) if v.key not in refitted]
+    return tuple(near)
+
+
+def _held_residuals(found: Fit, held_out: Recordings) -> list[Float[np.ndarray, "_ joints"]]:
+    comparison = compare(found, held_out)
+    return compared(found.loop, held_out, list(comparison.residuals))
+
+
+def _whitened_error(
+    residuals: Sequence[Float[np.ndarray, "samples_ joints"]], noise: Sequence[ARFilter]
+) -> float:
+    """Squared error in units of the noise's innovations."""
+    total = 0.0
+    for r in residuals:
+        mask = np.ones((1, len(r)), bool)
+        total += float(np.sum(whitened(r[None], noise, mask) ** 2))
+    return total
+
+
+def _need(last: Step, which: int, added: Sequence[int]) -> float:
+    """p-value of an added effect's parameters being nothing, from the whitened information."""
+    loop = last.fit.loop
+    position = len(loop.effects) - len(added) + list(added).index(which)
+    places = [place for place, _, _ in effect_parameters(loop, loop.effects[position])]
+    base = last.diagnosis.data.base
+    data = last.diagnosis.data
+    z = whitened(base, last.diagnosis.noise, data.mask).reshape(-1, base.shape[-1])
+    information = z.T @ z
+    covariance = np.linalg.pinv(information, rcond=1e-12)
+    linear = [p for p in places if _is_amplitude(loop, p)] or places[:1]
+    block = covariance[np.ix_(linear, linear)]
+    values = last.fit.theta[linear]
+    statistic = float(values @ np.linalg.pinv(block, rcond=1e-12) @ values)
+    return float(stats.chi2.sf(statistic, len(linear)))
+
+
+def _is_amplitude(loop: ClosedLoop, place: int) -> bool:
+    start = 0
+    for p in loop.free_parameters:
+        if start <= place < start + p.size:
+            return p.declaration.linear
+        start += p.size
+    return False
+
+
+# --- saved steps --------------------------------------------------------------------------------
+
+
+class _Journal(eqx.Module):
+    """A file with the steps so far, so that an interrupted discovery goes on where it was."""
+
+    path: Path | None
+    loop: ClosedLoop
+    recordings: Recordings
+
+    def save(self, steps: Sequence[Step]) -> None:
+        """Writes the steps at once: a new file, then its name."""
+        if self.path is None:
+            return
+        content = {
+            "robot": self.loop.name,
+            "recordings": list(self.recordings.names),
+            "added": [
+                {
+                    "effect": type(step.added).__name__,
+                    "fields": _fields(step.added),
+                    "alike": [list(key) for key in step.alike],
+                    "theta": step.fit.theta.tolist(),
+                }
+                for step in steps
+                if step.added is not None
+            ],
+        }
+        draft = self.path.with_suffix(self.path.suffix + ".part")
+        draft.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        draft.replace(self.path)
+
+    def replay(self, search: _Search, loop: ClosedLoop, say: Callable[[str], None]) -> list[Step]:
+        """The steps that the file holds, fitted again from their own values; or the first."""
+        steps = [search.begin(loop, say)]
+        if self.path is None or not self.path.exists():
+            return steps
+        try:
+            content = json.loads(self.path.read_text(encoding="utf-8"))
+            same = content["recordings"] == list(self.recordings.names)
+            entries = content["added"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ModelError(
+                f"{self.path} is not a journal of a discovery ({error!r}): delete it to start anew"
+            ) from error
+        if not same:
+            raise ModelError(
+                f"{self.path} belongs to other recordings ({', '.join(content['recordings'])}): "
+                "give another file, or delete it to start anew"
+            )
+        classes = {c.__name__: c for c in search.catalogue if isinstance(c, type)}
+        for entry in entries:
+            if entry["effect"] not in classes:
+                raise ModelError(
+                    f"{self.path} holds the effect {entry['effect']}, which is not in this "
+                    "catalogue: add it, or delete the file to start anew"
+                )
+            effect = classes[entry["effect"]](**entry["fields"])
+            grown = steps[-1].fit.loop.add(effect).with_theta(jnp.asarray(entry["theta"]))
+            say(f"again {effect.effect_name()}")
+            method = dataclasses.replace(_quiet(search.method), start="given")
+            found = fit(grown, self.recordings, method)
+            name = _name(effect.effect_name(), getattr(effect, "joint", None))
+            alike = tuple((n, j) for n, j in entry["alike"])
+            steps.append(search.step(f"+ {name}", found, added=found.loop.effects[-1], alike=alike))
+        return steps
+
+
+def _fields(effect: AbstractEffect) -> dict[str, Any]:
+    values = {}
+    for field in dataclasses.fields(effect):
+        value = getattr(effect, field.name)
+        values[field.name] = np.asarray(value).tolist() if hasattr(value, "dtype") else value
+    return values
