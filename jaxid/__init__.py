@@ -21,6 +21,7 @@ from .estimate import IDIMIV as IDIMIV  # noqa: E402
 from .estimate import OEM as OEM  # noqa: E402
 from .estimate import Filtering as Filtering  # noqa: E402
 from .estimate import Fit as Fit  # noqa: E402
+from .estimate import SeparablePEM as SeparablePEM  # noqa: E402
 from .estimate import Status as Status  # noqa: E402
 from .estimate import fit as fit  # noqa: E402
 from .loop import ClosedLoop as ClosedLoop  # noqa: E402

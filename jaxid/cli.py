@@ -1,17 +1,21 @@
-"""The command line: `jaxid demo`, `fit`, `compare`."""
+"""The command line: `jaxid demo`, `fit`, `compare`, `discover`."""
 
 import contextlib
 import importlib.util
 import json
+import math
+import os
 import sys
+import warnings
 from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
-from .errors import JaxidError, ModelError
+from .errors import JaxidError, JaxidWarning, ModelError, RecordingError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -113,20 +117,58 @@ def _read(files: list[Path], column: list[str] | None, unit: list[str] | None) -
 
 def _write(path: Path | None, content: dict[str, Any]) -> None:
     if path is not None:
-        path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        text = json.dumps(_plain(content), indent=1, ensure_ascii=False, allow_nan=False)
+        path.write_text(text + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """The same with null for what JSON has no number for."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_plain(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _check_outputs(*paths: Path | None) -> None:
+    """Says before the work, not after it, that a result would have nowhere to go."""
+    for path in paths:
+        if path is not None and not path.resolve().parent.is_dir():
+            raise ModelError(f"there is no folder {path.parent} for {path.name}: make it first")
+        if path is not None and path.is_dir():
+            raise ModelError(f"{path} is a folder: name a file in it")
+
+
+def _say(text: str, **style: Any) -> None:
+    """Prints a line, in colour where the terminal has it and the user wants it."""
+    plain = "NO_COLOR" in os.environ or not sys.stdout.isatty()
+    typer.echo(text if plain else typer.style(text, **style))
 
 
 @contextlib.contextmanager
-def _sentences() -> Iterator[None]:
-    """Ends on an error of jaxid's own with its one sentence, and without a traceback."""
-    try:
-        yield
-    except JaxidError as error:
-        typer.echo(f"jaxid: {error}", err=True)
-        raise typer.Exit(2) from None
-    except OSError as error:
-        typer.echo(f"jaxid: {error}", err=True)
-        raise typer.Exit(2) from None
+def _sentences(on_interrupt: str = "") -> Iterator[None]:
+    """Ends on a user's error with its one sentence and on Ctrl-C with a message, no traceback.
+
+    **Arguments:**
+
+    - `on_interrupt`: what else to say then.
+    """
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        try:
+            yield
+        except (JaxidError, OSError) as error:
+            typer.echo(f"jaxid: {error}", err=True)
+            raise typer.Exit(2) from None
+        except KeyboardInterrupt:
+            typer.echo(f"\njaxid: interrupted{on_interrupt}", err=True)
+            raise typer.Exit(130) from None
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *where: Any) -> None:
+    # The line of jaxid's source that warned says nothing to someone at a prompt.
+    said = str(message) if issubclass(category, JaxidWarning) else f"{category.__name__}: {message}"
+    typer.echo(f"jaxid: {said}", err=True)
 
 
 @app.command()
@@ -210,11 +252,122 @@ def _with_fitted(loop: Any, path: Path) -> Any:
     return loop.with_values(**found)
 
 
+class _Spread(TyperCommand):
+    """A command in which `--validate` takes every file up to the next option.
+
+    Only after the files to fit: in `--validate a.csv b.csv` with none before, the second is one
+    of those.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Writes `--validate` before each of its files, which is how one option takes several."""
+        valued = {name for p in self.params for name in p.opts if not getattr(p, "is_flag", True)}
+        return super().parse_args(ctx, spread(args, "--validate", valued))
+
+
+def spread(args: list[str], option: str, valued: set[str]) -> list[str]:
+    """Arguments in which an option that was given several values is repeated for each.
+
+    **Arguments:**
+
+    - `option`: the one that may take several.
+    - `valued`: options that take one value.
+    """
+    out: list[str] = []
+    fitted = taking = False
+    rest = iter(args)
+    for word in rest:
+        if word == "--":
+            return [*out, word, *rest]
+        if word.startswith("-") and word != "-":
+            name, equals, _ = word.partition("=")
+            taking = name == option and fitted
+            out.append(word)
+            if name in valued and not equals:
+                out.extend(value for value in [next(rest, None)] if value is not None)
+        elif taking:
+            out += [option, word]
+        else:
+            fitted = True
+            out.append(word)
+    return out
+
+
+@app.command(cls=_Spread)
+def discover(
+    files: Files,
+    validate: Annotated[
+        list[Path] | None,
+        typer.Option(help="Recordings held out of the fit, to judge by: one or several."),
+    ] = None,
+    robot: Robot = "scara",
+    json_file: Json = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Write the story to this HTML file, which needs no network.")
+    ] = None,
+    resume: Annotated[
+        Path | None, typer.Option(help="Save each step here, and go on from what it holds.")
+    ] = None,
+    column: Column = None,
+    unit: Unit = None,
+    controller: Controller = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print the verdict alone.")] = False,
+) -> None:
+    """Find the physical effect that the model lacks, and add it.
+
+    The exit code is 0 whatever the verdict, 2 where something given cannot be used.
+
+    \b
+    Examples:
+      jaxid discover fit_1.csv fit_2.csv --validate held_out.csv
+      jaxid discover run_*.csv --validate held_1.csv held_2.csv --robot my_robot.py:loop \\
+            --unit q=deg --json story.json --report story.html --resume steps.json
+    """
+    from .discovery import discover as run_discover
+
+    kept = "" if resume is None else f"; the same command goes on from the steps in {resume}"
+    with _sentences(kept):
+        _check_outputs(json_file, report, resume)
+        loop = _with_controller(load_robot(robot), controller)
+        held_out = list(validate or [])
+        _check_apart(files, held_out)
+        story = run_discover(
+            loop,
+            _read(files, column, unit),
+            validate=_read(held_out, column, unit) if held_out else None,
+            resume=resume,
+            progress=not quiet,
+        )
+        _tell(story, quiet)
+        _write(json_file, story.to_dict())
+        if report is not None:
+            story.report(report)
+
+
+def _check_apart(files: list[Path], held_out: list[Path]) -> None:
+    both = {path.resolve() for path in files} & {path.resolve() for path in held_out}
+    if both:
+        raise RecordingError(
+            f"{min(both).name} is both to be fitted and held out: what judges a model must not "
+            "have made it"
+        )
+
+
+def _tell(story: Any, quiet: bool = False) -> None:
+    verdict, _, rest = repr(story).partition("\n")
+    colour = "yellow" if story.verdict == "outside_catalogue" else "green"
+    _say(verdict, bold=True, fg=colour)
+    if not quiet:
+        typer.echo(rest)
+
+
 @app.command()
 def demo() -> None:
-    """The story on bundled recordings: a model that fits, and one that lacks an effect."""
-    from .discovery import compare as run_compare
-    from .estimate import fit as run_fit
+    """The story on bundled recordings: a model that suffices, and one that lacks an effect.
+
+    Takes about a minute, most of it to compile.
+    """
+    from .discovery import discover as run_discover
     from .recording import read
 
     with _sentences():
@@ -222,17 +375,45 @@ def demo() -> None:
             ("clean", "1. Recordings of a SCARA that the model describes"),
             ("hidden", "2. The same arm with a physical effect that the model lacks"),
         ):
-            folder = resources.files("jaxid") / "demo" / kind
-            with resources.as_file(folder) as path:
+            with resources.as_file(resources.files("jaxid") / "demo" / kind) as path:
                 used = read(path / "fit_1.csv", path / "fit_2.csv")
                 unseen = read(path / "held_out.csv")
-            typer.echo(f"\n{says}\n{'-' * len(says)}")
-            found = run_fit(load_robot("scara"), used)
-            typer.echo(repr(found))
-            typer.echo("\non a recording the fit never saw:")
-            typer.echo(repr(run_compare(found, unseen)))
+            _say(f"\n{says}", bold=True)
+            story = run_discover(load_robot("scara"), used, validate=unseen)
+            _tell(story)
+            _error_falls(story)
+        typer.echo("\nOn your own recordings: jaxid discover --help")
+
+
+def _error_falls(story: Any) -> None:
+    """A bar a step: held-out error of the joint at which the starting model did worst."""
+    table = story.table()
+    if len(table) < 2:
+        return
+    held = table[[name for name in table.columns if name.startswith("held out")]]
+    worst = str(held.iloc[0].idxmax())
+    error = held[worst]
+    typer.echo(f"\nerror on the recording that no fit saw ({worst.removeprefix('held out, ')}):")
+    width = max(len(str(step)) for step in error.index)
+    for step, value in error.items():
+        bar = "█" * max(1, round(30 * value / error.max()))
+        typer.echo(f"  {step!s:<{width}}  {bar} {value:.2f} %")
+
+
+def _keep_programs() -> None:
+    """Keeps compiled programs between runs: compiling is most of what a user waits for."""
+    import jax
+
+    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
+        return
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    jax.config.update("jax_compilation_cache_dir", str(Path(base) / "jaxid"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
 def main() -> None:
     """Entry point of the `jaxid` command."""
+    # Where there is no home or it cannot be written, each run compiles for itself.
+    with contextlib.suppress(OSError, RuntimeError):
+        _keep_programs()
     app()

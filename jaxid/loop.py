@@ -189,6 +189,28 @@ def rest(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"
     return State(q, v, effects, loop.controller.initial_state(read(loop, q, v)))
 
 
+def settle(
+    loop: ClosedLoop,
+    t: Float[Array, ""],
+    state: State,
+    reference: Reference,
+    label: Int[Array, ""],
+) -> State:
+    """The state with the effects' own parts as the first command finds them: none ramps up."""
+    seen = read(loop, state.q, state.v)
+    mass = loop.arm.mass_matrix(state.q)
+    tau = loop.controller.command(seen, reference, state.controller, mass)
+    motion = Motion(t, state.q, state.v, jnp.zeros_like(state.q), tau, jnp.zeros(0), label)
+    settled = []
+    for effect in loop.effects:
+        own = effect.settled(motion)
+        settled.append(own)
+        motion = dataclasses.replace(
+            motion, tau=effect.command(dataclasses.replace(motion, state=own))
+        )
+    return dataclasses.replace(state, effects=tuple(settled))
+
+
 def read(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Reading:
     """What the sensors report at a position and velocity, `(joints,)`."""
 
@@ -341,16 +363,12 @@ def _accelerations(
     load = effect_load(loop, motion, state.effects)
     # Inertia is on the left-hand side already.
     available = motion.tau - load + added @ motion.a + push
-    rigid = solve_positive(matrix, available - bias)
     transmissions = [
         (k, e) for k, e in enumerate(loop.effects) if isinstance(e, AbstractTransmission)
     ]
     if not transmissions:
-        return rigid, {}
-    soft, twisting = _through_transmissions(loop, state, transmissions, available, added)
-    present = jnp.any(jnp.stack([e.present() for _, e in transmissions]))
-    still = {k: jnp.where(e.present(), twisting[k], 0.0) for k, e in transmissions}
-    return jnp.where(present, soft, rigid), still
+        return solve_positive(matrix, available - bias), {}
+    return _through_transmissions(loop, state, transmissions, available, added)
 
 
 def _through_transmissions(
@@ -363,18 +381,20 @@ def _through_transmissions(
     """Rotors on the drive's side, the rest of the inertia on the link's (Spong 1987)."""
     q, v, on_link, rotors = state.q, state.v, available, jnp.zeros_like(state.q)
     for k, transmission in transmissions:
-        j, (twist, rate) = transmission.joint - 1, state.effects[k]
+        j, there = transmission.joint - 1, transmission.present()
+        twist, rate = jnp.where(there, state.effects[k], 0.0)
         q, v = q.at[j].add(twist), v.at[j].add(rate)
-        on_link = on_link.at[j].set(transmission.through(twist, rate))
-        rotors = rotors.at[j].set(transmission.rotor)
+        passed = transmission.through(twist, rate)
+        on_link = on_link.at[j].set(jnp.where(there, passed, on_link[j]))
+        rotors = rotors.at[j].set(jnp.where(there, transmission.rotor, 0.0))
     matrix = loop.arm.mass_matrix(q) + added - jnp.diag(rotors)
     link = solve_positive(matrix, on_link - loop.arm.bias(q, v))
     a, twisting = link, {}
     for k, transmission in transmissions:
-        j = transmission.joint - 1
+        j, there = transmission.joint - 1, transmission.present()
         drive = (available[j] - on_link[j]) / transmission.rotor
-        a = a.at[j].set(drive)
-        twisting[k] = link[j] - drive
+        a = a.at[j].set(jnp.where(there, drive, link[j]))
+        twisting[k] = jnp.where(there, link[j] - drive, 0.0)
     return a, twisting
 
 

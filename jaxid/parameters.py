@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .errors import ModelError
@@ -185,6 +186,11 @@ def set_by_name(model: Any, **values: float) -> Any:
         if name not in known:
             raise ModelError(
                 f"there is no parameter {name!r} in this model: it has {', '.join(known)}"
+            )
+    for name, value in values.items():
+        if np.size(value) != known[name].size:
+            raise ModelError(
+                f"{name} holds {known[name].size} values, not {np.size(value)}: give that many"
             )
     chosen = [known[name] for name in values]
     flat = jnp.concatenate([jnp.ravel(as_float64(v)) for v in values.values()])

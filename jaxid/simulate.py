@@ -14,7 +14,7 @@ from scipy import interpolate
 
 from .control import Reading, Reference
 from .errors import RecordingError
-from .loop import ClosedLoop, Instant, State, instant, rest
+from .loop import ClosedLoop, Instant, State, instant, rest, settle
 from .recording import Recording, Recordings
 from .smoothing import Band
 from .stepping import flow
@@ -159,11 +159,20 @@ def start_of(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 def at_rest(recording: Recording) -> bool:
     """Whether the arm starts with less than a hundredth of its highest speed."""
     _, start = start_of(recording)
-    step = 10
+    step = min(10, recording.samples - 1)
     speed = (recording.q[step:] - recording.q[:-step]) / (
         recording.time[step:] - recording.time[:-step]
     )[:, None]
     return bool(np.all(np.abs(start) < 1e-2 * np.abs(speed).max(axis=0)))
+
+
+def check_joints(loop: ClosedLoop, recording: Recording) -> None:
+    """Raises `RecordingError` where a recording has other joints than the loop."""
+    if recording.joints != loop.joints:
+        raise RecordingError(
+            f"{recording.name} has {recording.joints} joints, but the robot {loop.name} has "
+            f"{loop.joints}: choose another robot, or name the columns of its joints"
+        )
 
 
 def prepare(
@@ -181,11 +190,7 @@ def prepare(
 
     **Raises:** `RecordingError` where the joints do not match, `ModelError` from the controller.
     """
-    if recordings[0].joints != loop.joints:
-        raise RecordingError(
-            f"{recordings[0].name} has {recordings[0].joints} joints, but the robot {loop.name} "
-            f"has {loop.joints}: choose another robot, or name the columns of its joints"
-        )
+    check_joints(loop, recordings[0])
     period = loop.controller.period
     grids = [_grid(r, period) for r in recordings]
     length = max(len(grid) for grid, _ in grids)
@@ -284,10 +289,15 @@ def unflatten(loop: ClosedLoop) -> Callable[[Float[Array, " states"]], State]:
 
 
 def initial(
-    loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]
+    loop: ClosedLoop,
+    intervals: Interval,
+    q: Float[Array, " joints"],
+    v: Float[Array, " joints"],
 ) -> Float[Array, " states"]:
-    """The flat state at a position and velocity with all else at rest, `(states,)`."""
-    return ravel_pytree(rest(loop, q, v))[0]
+    """The flat state at the start of a run, at a position and velocity, `(states,)`."""
+    first = jax.tree.map(lambda leaf: leaf[0], intervals)
+    reference = _reference(first, jnp.zeros(()))
+    return ravel_pytree(settle(loop, first.t0, rest(loop, q, v), reference, first.label))[0]
 
 
 def advance(
@@ -382,7 +392,7 @@ def run_with_sensitivities(
 @eqx.filter_jit
 def _simulate(loop: ClosedLoop, batch: Batch) -> Simulated:
     def one(intervals, at, q0, v0, time):
-        states, seen = run(loop, intervals, initial(loop, q0, v0))
+        states, seen = run(loop, intervals, initial(loop, intervals, q0, v0))
         if at is not None:
             states, seen = states[at], seen[at]
         tau, q, v, a, delivered = jnp.moveaxis(seen, 1, 0)
@@ -422,16 +432,19 @@ def simulate(
 def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     """The loop with the number of steps between samples settled, where the user left it open.
 
-    A step is at most 2.5 ms, and at most one and a half time constants of the fastest mode met
+    A step is at most 2.5 ms, and at most a third of the fastest time constant, met
     with friction at its steepest, at standstill.
     """
+    check_joints(loop, recordings[0])
     if loop.stepping.substeps is not None:
         return loop
     period = loop.controller.period
     longest = max(r.period for r in recordings)
     interval = longest if period is None else min(longest, period)
     rate = fastest_rate(loop, recordings)
-    substeps = int(np.ceil(max(interval / 2.5e-3, interval * rate / 1.5) - 1e-9))
+    # The torque of a stiff made-up law is wrong by about (pace · step)⁴ / 20.
+    pace = 7 * loop.controller.pace
+    substeps = int(np.ceil(interval * max(1 / 2.5e-3, rate / 1.5, pace) - 1e-9))
     return set_substeps(loop, int(np.clip(substeps, 1, 64)))
 
 
@@ -458,7 +471,7 @@ def _slopes(loop: ClosedLoop, q: Float[Array, "points joints"]) -> Float[Array, 
         now = instant(loop, jnp.zeros(()), state, reference, zeros, Reading(zeros, zeros), NOBODY)
         return ravel_pytree(now.derivative)[0]
 
-    return jax.vmap(lambda at: jax.jacfwd(rate)(initial(loop, at, zeros), at))(q)
+    return jax.vmap(lambda at: jax.jacfwd(rate)(ravel_pytree(rest(loop, at, zeros))[0], at))(q)
 
 
 def _fastest(loop: ClosedLoop, q: Float[Array, "points joints"]) -> float:

@@ -23,7 +23,10 @@ def _configure_jax() -> None:
 
 
 _configure_jax()
-jaxtyping.install_import_hook("jaxid", "beartype.beartype")
+# A whole number where a float is asked for is no mistake (PEP 484's numeric tower).
+jaxtyping.install_import_hook(
+    "jaxid", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+)
 
 SHARED_DATA = Path(__file__).parents[1].parent / "shared" / "data"
 

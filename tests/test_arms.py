@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
+import jaxid
 from jaxid.arms import SCARA, Axis, TwoLink
 from jaxid.control import OpenLoop
 from jaxid.effects import AbstractEffect, Coulomb, Motion, Viscous, smooth_sign
 from jaxid.errors import ModelError
 from jaxid.loop import inverse
 from jaxid.parameters import list_parameters, read_values
-
-import jaxid
 
 G = 9.81
 LENGTH = 0.5

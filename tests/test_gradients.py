@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
+import jaxid
 from jaxid import effects
 from jaxid.arms import Axis
 from jaxid.control import PD, Cascade, OpenLoop, Sampled, Tracking
@@ -27,8 +29,6 @@ from jaxid.simulate import (
     set_substeps,
     with_substeps,
 )
-
-import jaxid
 
 ROWS = tuple(SIGNALS.index(name) for name in ("tau", "q", "v", "delivered"))
 FINE = 32
@@ -240,7 +240,13 @@ KINDS = sorted(
 # Fields that are no parameters and have no default.
 SETTINGS = {"coordinate": "q"}
 # Further settings of an effect that take another way through the loop.
-VARIANTS = {"Curve": [{"coordinate": "a"}, {"coordinate": "tau", "signed": True}]}
+VARIANTS = {
+    "Curve": [
+        # Wide enough for all accelerations: at its ends a curve has a kink.
+        {"coordinate": "a", "low": -40.0, "high": 40.0},
+        {"coordinate": "tau", "signed": True},
+    ]
+}
 
 
 def typical(kind, **settings):

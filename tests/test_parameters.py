@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jaxtyping import Array, Float
+
+import jaxid
 from jaxid.arms import SCARA
 from jaxid.effects import AbstractEffect, Coulomb, Viscous
 from jaxid.errors import ModelError
@@ -24,9 +27,6 @@ from jaxid.parameters import (
     sliding_unit,
     write_values,
 )
-from jaxtyping import Array, Float
-
-import jaxid
 
 
 class Curve(AbstractEffect):
@@ -178,6 +178,11 @@ def test_setting_by_name():
     assert (values["MY2"], values["Fc1"], values["ZZ1r"]) == (0.3, 2.0, 3.0)
     with pytest.raises(ModelError, match="no parameter 'Fc3'.*it has ZZ1r, ZZ2, MX2"):
         set_by_name(jaxid.scara(), Fc3=1.0)
+
+
+def test_setting_several_values_by_one_is_refused():
+    with pytest.raises(ModelError, match="height2"):
+        jaxid.scara().add(Curve(joint=2)).with_values(height2=1.0)
 
 
 # --- bounds -----------------------------------------------------------------------------------

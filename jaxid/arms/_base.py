@@ -44,6 +44,10 @@ class AbstractArm(eqx.Module):
         """Lengths of the links before the last, m; what a payload's torque needs."""
         return ()
 
+    def first_moments(self) -> tuple[tuple[float, float] | None, ...]:
+        """First moments (MX, MY) of each link in its own frame, kg·m; None where not known."""
+        return (None,) * self.joints
+
     def gravity(self) -> float:
         """Gravity in the plane of motion, m/s²."""
         return 0.0

@@ -30,6 +30,10 @@ class SCARA(AbstractArm):
         """The first link's, m."""
         return (self.length,)
 
+    def first_moments(self) -> tuple[tuple[float, float] | None, ...]:
+        """The second link's, kg·m; without gravity the first's does not show."""
+        return None, (float(self.MX2), float(self.MY2))
+
     def mass_matrix(self, q: Float[Array, " joints"]) -> Float[Array, "joints joints"]:
         """Inertia at q, `(2, 2)`, kg·m²."""
         coupling = self.length * (self.MX2 * jnp.cos(q[1]) - self.MY2 * jnp.sin(q[1]))

@@ -51,6 +51,10 @@ class TwoLink(AbstractArm):
         """The first link's as given, or as p3 / p5 has it, m."""
         return (self.link_length or float(self.coupling / self.p5),)
 
+    def first_moments(self) -> tuple[tuple[float, float] | None, ...]:
+        """Both links', kg·m."""
+        return (float(self.p4), 0.0), (float(self.p5), 0.0)
+
     def gravity(self) -> float:
         """As given, m/s²."""
         return self.g

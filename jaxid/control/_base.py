@@ -77,6 +77,11 @@ class AbstractController(eqx.Module):
         """What of the command acts now, `(joints,)`; all of it unless the loop has a delay."""
         return command
 
+    @property
+    def pace(self) -> float:
+        """How fast a law made up for the simulation is, 1/s, where steps must resolve it."""
+        return 0.0
+
     def comparable(self, recording: Recording) -> float | None:
         """Frequency up to which measured and simulated torque may be compared, Hz; None for all.
 

@@ -28,9 +28,14 @@ class Tracking(AbstractController):
       noise.
     """
 
-    bandwidth: float = 60.0
+    bandwidth: float = 40.0
     damping: float = 1.0
     cutoff: float | None = eqx.field(static=True, default=None)
+
+    @property
+    def pace(self) -> float:
+        """The virtual loop's, 1/s."""
+        return 2 * math.pi * self.bandwidth
 
     def command(
         self,

@@ -20,7 +20,7 @@ from ..estimate.oem import pieces_of
 from ..loop import ClosedLoop
 from ..noise import autocorrelation
 from ..recording import Recording, Recordings
-from ..simulate import Simulated, simulate
+from ..simulate import Simulated, band_of, compared, simulate
 
 
 class Comparison(eqx.Module):
@@ -47,20 +47,37 @@ class Comparison(eqx.Module):
         assert isinstance(table, pd.DataFrame)
         return table
 
+    def judged(self, recording: int | str = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Time, measured and simulated signal as they are compared, `(samples, joints)`.
+
+        Where the controller is made up, both have passed its low-pass and lost their ends.
+
+        **Arguments:**
+
+        - `recording`: number from 0, or name.
+        """
+        k = self._index(recording)
+        record, run = self.recordings[k], self.runs[k]
+        if self.signal == "position":
+            return record.time, record.q, np.asarray(run.q)
+        pair = (record.tau, np.asarray(run.tau))
+        measured, simulated = (compared(self.loop, [record], [x])[0] for x in pair)
+        band = band_of(self.loop, [record])
+        kept = slice(None) if band is None else np.asarray(band.keep)[0]
+        return record.time[kept], measured, simulated
+
     @property
     def residuals(self) -> tuple[Float[np.ndarray, "samples_ joints"], ...]:
-        """Measured less simulated, one `(samples, joints)` for each recording."""
-        name = "q" if self.signal == "position" else "tau"
-        return tuple(
-            getattr(r, name) - getattr(run, name)
-            for r, run in zip(self.recordings, self.runs, strict=True)
-        )
+        """Measured less simulated as they are compared, one `(samples, joints)` a recording."""
+        found = [self.judged(k) for k in range(len(self.recordings))]
+        return tuple(measured - simulated for _, measured, simulated in found)
 
     def autocorrelation(
         self, recording: int | str = 0, lags: int = 38
     ) -> tuple[Float[np.ndarray, "lags_and_zero joints"], float]:
         """Autocorrelation of each joint's residual from lag 0, and the two-sigma bound."""
-        residual = self.residuals[self._index(recording)]
+        _, measured, simulated = self.judged(recording)
+        residual = measured - simulated
         columns = [autocorrelation([x - x.mean()], lags) for x in residual.T]
         return np.stack([c for c, _ in columns], axis=1), columns[0][1]
 
@@ -82,7 +99,7 @@ class Comparison(eqx.Module):
         - `recording`: number from 0, or name.
         """
         k = self._index(recording)
-        name = "q" if self.signal == "position" else "tau"
+        time, measured, simulated = self.judged(k)
         acf, bound = self.autocorrelation(k)
         torque, position = self.loop.arm.units()
         units = position if self.signal == "position" else torque
@@ -90,10 +107,10 @@ class Comparison(eqx.Module):
         percent = self.error_percent.iloc[k]
         joints = [f"{label} ({percent[label]:.2f} %)" for label in percent.index]
         return figures.comparison(
-            record.time,
-            getattr(record, name),
-            np.asarray(getattr(self.runs[k], name)),
-            self.residuals[k],
+            time,
+            measured,
+            simulated,
+            measured - simulated,
             acf,
             bound,
             joints,
@@ -210,10 +227,9 @@ def _errors(loop: ClosedLoop, recordings: Recordings, runs: tuple[Simulated, ...
         [np.asarray(v) - np.asarray(run.v) for v, run in zip(velocity, runs, strict=True)],
     )
     if not isinstance(loop.controller, OpenLoop):
-        torque = [r.tau for r in recordings]
-        tables["torque"] = relative_errors(
-            recordings, torque, [r.tau - np.asarray(run.tau) for r, run in pairs]
-        )
+        torque = compared(loop, recordings, [r.tau for r in recordings])
+        left = compared(loop, recordings, [r.tau - np.asarray(run.tau) for r, run in pairs])
+        tables["torque"] = relative_errors(recordings, torque, left)
     together = pd.concat(tables, names=["signal"]).reorder_levels(["recording", "signal"])
     columns = joint_columns(loop.joints)
     order = [(r.name, s) for r in recordings for s in tables]

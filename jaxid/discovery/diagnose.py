@@ -61,12 +61,14 @@ class Diagnosis(eqx.Module):
     """Where a fitted model fails and which effects may be missing, ranked.
 
     - `ranking`: the catalogue's entries, each at its best setting, best first.
+    - `forms`: the same for every form of an effect (class) on its own.
     - `where`: free-form curves of every coordinate, best first.
     - `noise`: the noise filter of each output.
     """
 
     fit: Fit
     ranking: tuple[Verdict, ...]
+    forms: tuple[Verdict, ...]
     where: tuple[Verdict, ...]
     noise: tuple[ARFilter, ...]
     data: Data
@@ -320,7 +322,8 @@ def diagnose(
 
 def _as_fitted(fit: Fit, loop: ClosedLoop) -> tuple[str, Batch, np.ndarray]:
     """Which output is compared, the batch, and which initial states are free, as in the fit."""
-    method = fit.method if isinstance(fit.method, OEM) else OEM()
+    method = getattr(fit.method, "oem", fit.method)
+    method = method if isinstance(method, OEM) else OEM()
     pieces = pieces_of(fit.recordings, method.window)
     batch = prepare(loop, pieces)
     return _signals(method, loop)[0], batch, _free_starts(method, pieces, batch)
@@ -396,7 +399,8 @@ def _judge(
     noise, picked = estimate_noise(data, blocks)
     gram = gram_of(data, noise)
     tests = effective_tests(gram, blocks)
-    ranking: dict[tuple[str, int | None], Verdict] = {}
+    ranking: dict[tuple[Any, ...], Verdict] = {}
+    forms: dict[tuple[Any, ...], Verdict] = {}
     where: dict[tuple[Any, ...], Verdict] = {}
     for hypothesis in hypotheses:
         verdict = _verdict(gram, hypothesis, tests)
@@ -404,16 +408,13 @@ def _judge(
         if isinstance(effect, Curve):
             where[(effect.label, effect.joint, effect.signed)] = verdict
             continue
-        before = ranking.get(verdict.key)
-        if before is None or (verdict.possible, verdict.evidence) > (
-            before.possible,
-            before.evidence,
-        ):
-            ranking[verdict.key] = verdict
+        _keep_better(ranking, verdict.key, verdict)
+        _keep_better(forms, (*verdict.key, type(effect)), verdict)
     columns = [c for k in picked for c in blocks[k]]
     return Diagnosis(
         fit,
         tuple(sorted(ranking.values(), key=_order, reverse=True)),
+        tuple(sorted(forms.values(), key=_order, reverse=True)),
         tuple(sorted(where.values(), key=_order, reverse=True)),
         noise,
         data,
@@ -423,6 +424,13 @@ def _judge(
         tests,
         significance,
     )
+
+
+def _keep_better(found: dict[tuple[Any, ...], Verdict], key: tuple[Any, ...], new: Verdict) -> None:
+    """Keeps the better of two settings; one that is not physical gives way to one that is."""
+    old = found.get(key)
+    if old is None or (new.possible, new.evidence) > (old.possible, old.evidence):
+        found[key] = new
 
 
 def _order(verdict: Verdict) -> float:

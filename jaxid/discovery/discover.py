@@ -20,7 +20,7 @@ from .. import figures
 from ..effects import AbstractEffect, Curve
 from ..effects import catalogue as known
 from ..errors import ModelError
-from ..estimate import OEM, Fit, fit
+from ..estimate import OEM, Fit, SeparablePEM, fit
 from ..loop import ClosedLoop
 from ..noise import ARFilter
 from ..parameters import Bounds, list_parameters, read_values, write_values
@@ -144,6 +144,20 @@ class Discovery(eqx.Module):
         curve = self.diagnosis.predicted(self.diagnosis.where[0])
         assert isinstance(curve, Curve)
         return curve
+
+    def report(self, path: str | Path) -> Path:
+        """Writes the story as one self-contained HTML page.
+
+        **Arguments:**
+
+        - `path`: the file to write; its folder must exist.
+
+        **Raises:** `ModelError` where the folder does not exist.
+        """
+        # The page stands on a higher floor: nothing here depends on it but this call.
+        from ..report import write
+
+        return write(self, path)
 
     def to_dict(self) -> dict[str, Any]:
         """The story as plain JSON, as `jaxid discover --json` writes it."""
@@ -305,7 +319,11 @@ class _Search(eqx.Module):
         say("fit of the starting model")
         first = fit(loop, self.recordings, _quiet(self.method))
         say("diagnosis of the starting model")
-        return self.step("start", first)
+        step = self.step("start", first)
+        # With the noise known, once more: where it is strongly coloured, plain output error leaves
+        # the parameters so far off that what follows would have to explain that.
+        again = fit(first.loop, self.recordings, self.whitened_method(step.diagnosis))
+        return self.step("start", again) if again.succeeded else step
 
     def step(self, label: str, found: Fit, **extra: Any) -> Step:
         """A step with its diagnosis and its error on held-out recordings."""
@@ -331,7 +349,7 @@ class _Search(eqx.Module):
         ]
         if not entries or len(steps) > most:
             return "outside_catalogue", None
-        contenders = self.refit(last, _leading(entries), say)
+        contenders = self.refit(last, _with_forms(_leading(entries), diagnosis.forms), say)
         best = contenders[0] if contenders else None
         if best is None or best.criterion >= self.criterion(last.fit, diagnosis.noise):
             return "outside_catalogue", None
@@ -356,12 +374,16 @@ class _Search(eqx.Module):
         for verdict in leading:
             say(f"refit with {_name(*verdict.key)}")
             loop = last.fit.loop.add(_inside(last.diagnosis.predicted(verdict)))
-            method = dataclasses.replace(_quiet(self.method), start="given")
-            refitted = fit(loop, self.recordings, method)
+            refitted = fit(loop, self.recordings, self.whitened_method(last.diagnosis))
             value = self.criterion(refitted, last.diagnosis.noise)
             if np.isfinite(value):
                 found.append(Contender(*verdict.key, refitted, value))
         return sorted(found, key=lambda c: c.criterion)
+
+    def whitened_method(self, diagnosis: Diagnosis) -> SeparablePEM:
+        """The method with the noise filters of a diagnosis: efficient where noise is coloured."""
+        method = dataclasses.replace(_quiet(self.method), start="given")
+        return SeparablePEM(method, filters=diagnosis.noise)
 
     def criterion(self, found: Fit, noise: Sequence[ARFilter]) -> float:
         """Whitened squared error on fitted and held-out recordings, and BIC's price.
@@ -396,11 +418,8 @@ class _Search(eqx.Module):
             position = len(steps[-1].fit.loop.effects) - len(added) + added.index(weakest)
             loop = steps[-1].fit.loop
             kept = loop.effects[:position] + loop.effects[position + 1 :]
-            found = fit(
-                dataclasses.replace(loop, effects=kept),
-                self.recordings,
-                dataclasses.replace(_quiet(self.method), start="given"),
-            )
+            without = dataclasses.replace(loop, effects=kept)
+            found = fit(without, self.recordings, self.whitened_method(steps[-1].diagnosis))
             assert gone.added is not None
             removed.append((gone.added.effect_name(), getattr(gone.added, "joint", None)))
             final = steps[-1]
@@ -423,6 +442,24 @@ def _leading(entries: Sequence[Verdict]) -> list[Verdict]:
     best = entries[0].evidence
     close = [v for v in entries if v.evidence > best - max(30.0, 0.05 * best)]
     return close[:3]
+
+
+def _with_forms(leading: Sequence[Verdict], forms: Sequence[Verdict]) -> list[Verdict]:
+    """The leading entries, each with its other forms that are not far behind.
+
+    A form with fewer parameters may lose on a coarse grid of shapes and win once refitted.
+    """
+    chosen = list(leading)
+    for verdict in leading:
+        chosen += [
+            form
+            for form in forms
+            if form.key == verdict.key
+            and type(form.hypothesis.effect) is not type(verdict.hypothesis.effect)
+            and form.possible
+            and form.evidence > 0.5 * verdict.evidence
+        ]
+    return chosen
 
 
 def _inside(effect: AbstractEffect) -> AbstractEffect:
@@ -564,7 +601,7 @@ class _Journal(eqx.Module):
             effect = classes[entry["effect"]](**entry["fields"])
             grown = steps[-1].fit.loop.add(effect).with_theta(jnp.asarray(entry["theta"]))
             say(f"again {effect.effect_name()}")
-            method = dataclasses.replace(_quiet(search.method), start="given")
+            method = search.whitened_method(steps[-1].diagnosis)
             found = fit(grown, self.recordings, method)
             name = _name(effect.effect_name(), getattr(effect, "joint", None))
             alike = tuple((n, j) for n, j in entry["alike"])

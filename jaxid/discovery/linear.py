@@ -54,10 +54,12 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
         return slope[:m, :m], slope[:m, m:], slope[m:, :m], slope[m:, m:]
 
     def whole(intervals: Interval, q0, v0):
-        x0 = initial(loop, q0, v0)
+        x0 = initial(loop, intervals, q0, v0)
         states, seen = run(loop, intervals, x0)
         a, b, c, d = jax.vmap(at)(intervals, states)
-        start = jax.jacfwd(lambda z: initial(loop, z[:n], z[n:]))(jnp.concatenate([q0, v0]))
+        start = jax.jacfwd(lambda z: initial(loop, intervals, z[:n], z[n:]))(
+            jnp.concatenate([q0, v0])
+        )
         still = jnp.zeros((states.shape[0], 0))
         motion = jax.vmap(Motion)(
             intervals.t0,

@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import signal, stats
+from scipy.linalg.blas import dsyrk  # type: ignore[attr-defined]
 
 from ..noise import ARFilter, fit_ar
 
@@ -114,7 +115,13 @@ def gram_of(data: Data, noise: Sequence[ARFilter]) -> Gram:
     r = r - basis @ (basis.T @ r)
     outputs = data.residual.shape[2]
     count = float(data.mask.sum() * outputs - basis.shape[1])
-    return Gram(x.T @ x, x.T @ r, size, float(r @ r), count)
+    return Gram(products(x), x.T @ r, size, float(r @ r), count)
+
+
+def products(x: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns columns"]:
+    """X'X, of which BLAS need only do half."""
+    upper = dsyrk(1.0, x.T) if x.flags.c_contiguous else dsyrk(1.0, x, trans=1)
+    return np.triu(upper) + np.triu(upper, 1).T
 
 
 def noise_of(data: Data, leftover: Rows, lost: float) -> tuple[ARFilter, ...]:
@@ -149,7 +156,7 @@ def leftover(data: Data, noise: Sequence[ARFilter], columns: Sequence[int], ridg
     size = np.linalg.norm(w, axis=0)
     size[size == 0] = 1.0
     w /= size
-    normal = w.T @ w
+    normal = products(w)
     damp = np.full(len(size), 1e-12)
     damp[data.base.shape[-1] :] += ridge
     theta = np.linalg.solve(normal + np.diag(damp), w.T @ r) / size
@@ -199,12 +206,14 @@ def estimate_noise(
     every = range(data.table.shape[-1])
     noise = noise_of(data, leftover(data, flat, every, 1e-4), 0.0)
     chosen: list[int] = []
-    for _ in range(2):
-        gram = gram_of(data, noise)
-        chosen = select(gram, blocks, 12, 10.0)
+    for _ in range(3):
+        before = chosen
+        chosen = select(gram_of(data, noise), blocks, 12, 10.0)
         columns = [c for k in chosen for c in blocks[k]]
         rest = leftover(data, noise, columns, 1e-9)
         noise = noise_of(data, rest, data.base.shape[-1] + len(columns))
+        if chosen == before or not chosen:
+            break
     return noise, chosen
 
 
@@ -223,10 +232,9 @@ def effective_tests(
 
     The smallest p-value of correlated tests is distributed as that of fewer independent ones.
     """
-    values, vectors = np.linalg.eigh(gram.gram)
-    root = vectors * np.sqrt(np.maximum(values, 0))
-    rng = np.random.default_rng(seed)
-    noise = root @ rng.standard_normal((len(values), draws))
+    n = len(gram.gram)
+    root = np.linalg.cholesky(gram.gram + 1e-10 * np.eye(n))
+    noise = root @ np.random.default_rng(seed).standard_normal((n, draws))
     smallest = np.ones(draws)
     for block in blocks:
         chosen = list(block)

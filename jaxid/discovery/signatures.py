@@ -72,6 +72,7 @@ def survey(
         tuple(float(x) for x in loop.arm.link_lengths()),
         float(loop.arm.gravity()),
         tuple(loop.arm.prismatic()),
+        tuple(loop.arm.first_moments()),
     )
 
 
@@ -238,7 +239,7 @@ def _difference(
 @eqx.filter_jit
 def _finite(loop: ClosedLoop, batch: Batch, row: int) -> Float[Array, "recordings points joints"]:
     def one(intervals, q0, v0):
-        return run(loop, intervals, initial(loop, q0, v0))[1][:, row]
+        return run(loop, intervals, initial(loop, intervals, q0, v0))[1][:, row]
 
     return jax.vmap(one)(batch.intervals, batch.q0, batch.v0)
 

@@ -27,6 +27,7 @@ from .inertia import RotorInertia as RotorInertia
 from .position import EndStop as EndStop
 from .position import Gravity as Gravity
 from .position import Spring as Spring
+from .position import Tilt as Tilt
 from .position import TorqueOffset as TorqueOffset
 from .position import TorqueRipple as TorqueRipple
 from .sensor import EncoderEccentricity as EncoderEccentricity
@@ -50,6 +51,7 @@ catalogue: tuple[type[AbstractEffect], ...] = (
     TimeDelay,
     TorqueSaturation,
     Gravity,
+    Tilt,
     Spring,
     Payload,
     RotorInertia,

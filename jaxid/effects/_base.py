@@ -3,7 +3,7 @@
 import dataclasses
 import re
 from collections.abc import Iterable
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -55,7 +55,7 @@ class AbstractEffect(eqx.Module):
         return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
 
     @classmethod
-    def screened(cls, scene: Scene) -> Iterable[Self]:
+    def screened(cls, scene: Scene) -> Iterable["AbstractEffect"]:
         """Instances to screen, at zero amplitude: every joint, and a grid of shapes if it has any.
 
         Of effects in whose parameters nothing is linear: instances at a small finite setting.
@@ -65,13 +65,17 @@ class AbstractEffect(eqx.Module):
             return [cls()]
         return [cls(joint=j) for j in scene.joints]  # type: ignore[call-arg]
 
-    def scaled(self, factor: float) -> Self:
+    def scaled(self, factor: float) -> "AbstractEffect":
         """The effect at another size, where a finite setting was screened; itself by default."""
         return self
 
     def initial_state(self) -> Float[Array, " states"]:
         """Its own states at rest; none by default."""
         return jnp.zeros(0)
+
+    def settled(self, motion: Motion) -> Float[Array, " states"]:
+        """Its own states when a recording starts; at rest unless the first torque says more."""
+        return self.initial_state()
 
     def derivative(self, motion: Motion) -> Float[Array, " states"]:
         """Rate of its own states, per s."""

@@ -14,6 +14,7 @@ class Scene(eqx.Module):
     - `tones`: frequencies that stand out of the residual's spectrum, Hz.
     - `lengths`: of the links before the last, m; `g`: gravity in their plane, m/s².
     - `slides`: whether a joint slides.
+    - `moments`: first moments of each link in its own frame, kg·m; None where not known.
     """
 
     q_low: Float[np.ndarray, " joints"]
@@ -29,6 +30,7 @@ class Scene(eqx.Module):
     lengths: tuple[float, ...]
     g: float
     slides: tuple[bool, ...]
+    moments: tuple[tuple[float, float] | None, ...]
 
     @property
     def joints(self) -> range:

@@ -44,6 +44,10 @@ class ActuatorLag(AbstractEffect):
         """No torque yet, `(1,)`."""
         return jnp.zeros(1)
 
+    def settled(self, motion: Motion) -> Float[Array, " states"]:
+        """The first command, as if it had been there before, `(1,)`."""
+        return motion.tau[self.joint - 1][None]
+
     def derivative(self, motion: Motion) -> Float[Array, " states"]:
         """Rate of the delivered torque, `(1,)`, N·m/s."""
         slow = jnp.where(self.time_constant > 0, self.time_constant, 1.0)
@@ -77,6 +81,10 @@ class TimeDelay(AbstractEffect):
     def initial_state(self) -> Float[Array, " states"]:
         """Nothing on its way, `(2,)`."""
         return jnp.zeros(2)
+
+    def settled(self, motion: Motion) -> Float[Array, " states"]:
+        """The first command, as if it had been there before, `(2,)`."""
+        return jnp.repeat(motion.tau[self.joint - 1], 2)
 
     def _sections(self, motion: Motion) -> tuple[Float[Array, ""], Float[Array, ""]]:
         first = 2 * motion.state[0] - motion.tau[self.joint - 1]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..parameters import Scalar, Vector, parameter
+from ..parameters import Scalar, Vector, as_float64, parameter
 from ._base import AbstractEffect, Motion, on_joint
 from ._scene import Scene
 
@@ -112,4 +112,45 @@ class Gravity(AbstractEffect):
         """Gravity of each link and of those it carries, `(joints,)`."""
         angle = jnp.cumsum(motion.q)
         own = self.G * jnp.cos(angle) + self.H * jnp.sin(angle)
+        return jnp.cumsum(own[::-1])[::-1]
+
+
+class Tilt(AbstractEffect):
+    """Gravity in the plane of an arm whose links' first moments are known but for the first's.
+
+    Each link of moments (MX, MY) and angle phi in the plane adds
+    gx (MX sin phi + MY cos phi) - gy (MX cos phi - MY sin phi) to its own joint and those before;
+    the first link's moment lies along it. One parameter less than `Gravity`, of which it is a form.
+    """
+
+    gx: Scalar = parameter(0.0, symbol="gx", unit="m/s²", scale=0.1)
+    gy: Scalar = parameter(0.0, symbol="gy", unit="m/s²", scale=0.1)
+    first: Scalar | None = parameter(None, symbol="S1", unit="kg·m", scale=1.0, linear=False)
+    moments: Float[Array, "joints 2"] = eqx.field(converter=as_float64, default=((0.0, 0.0),))
+
+    @classmethod
+    def effect_name(cls) -> str:
+        """Gravity, of which it is one form."""
+        return "gravity"
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["Tilt"]:
+        """First moments from that of the last link to sixteen times it, where it is not known."""
+        known = [m for m in scene.moments if m is not None]
+        if any(scene.slides) or not known or None in scene.moments[1:]:
+            return []
+        if scene.moments[0] is not None:
+            return [cls(moments=scene.moments)]
+        size = float(np.hypot(*known[-1])) or 0.1
+        rows = ((0.0, 0.0), *scene.moments[1:])
+        return [cls(first=share * size, moments=rows) for share in (1.0, 4.0, 16.0)]
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """Gravity of each link and of those it carries, `(joints,)`."""
+        mx, my = self.moments[:, 0], self.moments[:, 1]
+        if self.first is not None:
+            mx, my = mx.at[0].set(self.first), my.at[0].set(0.0)
+        angle = jnp.cumsum(motion.q)
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        own = self.gx * (mx * s + my * c) - self.gy * (mx * c - my * s)
         return jnp.cumsum(own[::-1])[::-1]

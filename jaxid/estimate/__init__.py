@@ -9,3 +9,4 @@ from .didim import DIDIM as DIDIM
 from .didim import IDIMIV as IDIMIV
 from .idim import IDIM as IDIM
 from .oem import OEM as OEM
+from .pem import SeparablePEM as SeparablePEM

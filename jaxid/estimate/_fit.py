@@ -2,9 +2,10 @@
 
 from collections.abc import Iterable
 
-from ..errors import FitError, RecordingError
+from ..errors import FitError
 from ..loop import ClosedLoop
 from ..recording import Recording, Recordings
+from ..simulate import check_joints
 from ._base import AbstractMethod, Fit
 from .oem import OEM
 
@@ -25,11 +26,7 @@ def fit(
     **Raises:** `FitError`, `RecordingError` or `ModelError` where the three do not fit together.
     """
     recordings = Recordings.of(recordings)
-    if recordings.joints != loop.joints:
-        raise RecordingError(
-            f"{recordings[0].name} has {recordings.joints} joints, but the robot {loop.name} has "
-            f"{loop.joints}: choose another robot, or name the columns of its joints"
-        )
+    check_joints(loop, recordings[0])
     method = OEM() if method is None else method
     if not isinstance(method, AbstractMethod):
         raise FitError(f"{method!r} is not a method: give an object such as jaxid.OEM()")

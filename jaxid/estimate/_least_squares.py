@@ -18,9 +18,10 @@ class Sensitivity(eqx.Module):
     """Weighted residual of a batch and its derivatives, at one set of parameter values.
 
     `residual` is zero where there is no sample; `start` is its derivative by each recording's own
-    initial position and velocity.
+    initial position and velocity. `raw` is the residual before the noise filter.
     """
 
+    raw: Float[Array, "recordings samples outputs"]
     residual: Float[Array, "recordings samples outputs"]
     jacobian: Float[Array, "recordings samples outputs parameters"]
     start: Float[Array, "recordings samples outputs initials"] | None
@@ -31,6 +32,7 @@ def sensitivity(
     loop: ClosedLoop,
     batch: Batch,
     weights: Float[Array, " outputs"],
+    noise: Float[Array, "outputs taps"],
     signals: tuple[str, ...],
     free_start: bool,
 ) -> Sensitivity:
@@ -39,6 +41,7 @@ def sensitivity(
     **Arguments:**
 
     - `weights`: one over the deviation of each output, `(signals · joints,)`.
+    - `noise`: the polynomial A of each output's noise filter 1/A, padded with zeros.
     - `signals`: which of `"tau"` and `"q"` are outputs.
     - `free_start`: whether initial states are parameters too.
     """
@@ -46,8 +49,10 @@ def sensitivity(
     p, n = loop.theta.shape[0], loop.joints
 
     def one(intervals, at, q0, v0):
-        by_start = jax.jacfwd(lambda z: initial(loop, z[:n], z[n:]))(jnp.concatenate([q0, v0]))
-        x0 = initial(loop, q0, v0)
+        by_start = jax.jacfwd(lambda z: initial(loop, intervals, z[:n], z[n:]))(
+            jnp.concatenate([q0, v0])
+        )
+        x0 = initial(loop, intervals, q0, v0)
         extra = 2 * n if free_start else 0
         start = jnp.concatenate([jnp.zeros((x0.shape[0], p)), by_start[:, :extra]], axis=1)
         seen, slopes = run_with_sensitivities(loop, intervals, x0, start, rows)
@@ -63,7 +68,26 @@ def sensitivity(
     slopes = -slopes * scale[..., None]
     if batch.band is not None:
         residual, slopes = batch.band(residual), batch.band(slopes)
-    return Sensitivity(residual, slopes[..., :p], slopes[..., p:] if free_start else None)
+    white = filtered_by(noise, jnp.concatenate([residual[..., None], slopes], axis=-1))
+    white = white * batch.kept[..., None, None]
+    slopes = white[..., 1:]
+    by_start = slopes[..., p:] if free_start else None
+    return Sensitivity(residual, white[..., 0], slopes[..., :p], by_start)
+
+
+def filtered_by(
+    noise: Float[Array, "outputs taps"], x: Float[Array, "recordings samples outputs columns"]
+) -> Float[Array, "recordings samples outputs columns"]:
+    """A(z) x along the samples, for each output its own A; before the first sample all is zero."""
+
+    def body(total, tap):
+        lag, a = tap
+        earlier = jnp.roll(x, lag, axis=1)
+        known = jnp.arange(x.shape[1]) >= lag
+        return total + a[:, None] * jnp.where(known[:, None, None], earlier, 0.0), None
+
+    taps = (jnp.arange(noise.shape[1]), noise.T)
+    return jax.lax.scan(body, jnp.zeros_like(x), taps)[0]
 
 
 def absorb_start(found: Sensitivity, free: Float[Array, " recordings"]) -> Sensitivity:
@@ -82,7 +106,7 @@ def absorb_start(found: Sensitivity, free: Float[Array, " recordings"]) -> Sensi
     basis, size, _ = jnp.linalg.svd(s, full_matrices=False)
     basis = jnp.where((size > 1e-10 * size[:, :1])[:, None, :], basis, 0.0)
     j = j - basis @ jnp.einsum("rka,rkp->rap", basis, j)
-    return Sensitivity(found.residual, j.reshape(found.jacobian.shape), None)
+    return Sensitivity(found.raw, found.residual, j.reshape(found.jacobian.shape), None)
 
 
 class Point(eqx.Module):
@@ -115,6 +139,7 @@ class Problem(eqx.Module):
     loop: ClosedLoop
     batch: Batch
     weights: Float[Array, " outputs"]
+    noise: Float[Array, "outputs taps"]
     free: Float[Array, " recordings"]
     lower: Float[Array, " parameters"]
     upper: Float[Array, " parameters"]
@@ -132,7 +157,9 @@ def linearise(
     n = problem.loop.joints
     loop = problem.loop.with_theta(theta)
     batch = dataclasses.replace(problem.batch, q0=start[:, :n], v0=start[:, n:])
-    found = sensitivity(loop, batch, problem.weights, problem.signals, problem.free_start)
+    found = sensitivity(
+        loop, batch, problem.weights, problem.noise, problem.signals, problem.free_start
+    )
     count, p = start.shape[0], theta.shape[0]
     r = found.residual.reshape(count, -1)
     j = found.jacobian.reshape(count, -1, p)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..control import OpenLoop
 from ..errors import FitError, JaxidError
 from ..loop import ClosedLoop
-from ..noise.ar import fit_ar
+from ..noise import ARFilter, fit_ar
 from ..parameters import Bounds
 from ..progress import working
 from ..recording import Recording, Recordings
@@ -61,7 +61,7 @@ class OEM(AbstractMethod):
     initial: Literal["auto", "rest", "free"] = eqx.field(static=True, default="auto")
     window: float | None = eqx.field(static=True, default=None)
     deviations: Deviations = eqx.field(static=True, default="sandwich")
-    tolerance: float = 1e-3
+    tolerance: float = 1e-2
     max_steps: int = eqx.field(static=True, default=100)
     progress: bool = eqx.field(static=True, default=True)
 
@@ -194,23 +194,32 @@ def _first_weights(
 
 
 def _converge(
-    method: OEM, loop: ClosedLoop, recordings: Recordings, say: Callable[[str], None]
+    method: OEM,
+    loop: ClosedLoop,
+    recordings: Recordings,
+    say: Callable[[str], None],
+    filters: Sequence[ARFilter] | None = None,
 ) -> _Done:
-    """Minimises, then again with the weights and initial states that follow, until they settle."""
+    """Minimises, then again with the weights and initial states that follow, until they settle.
+
+    **Arguments:**
+
+    - `filters`: noise filter of each output; white noise where None.
+    """
     pieces = pieces_of(recordings, method.window)
     signals = _signals(method, loop)
     batch = prepare(loop, pieces)
     free = jnp.asarray(_free_starts(method, pieces, batch))
     weights = jnp.asarray(_first_weights(loop, pieces, signals))
+    noise = jnp.asarray(_taps(filters, weights.shape[0]))
     bounds = Bounds.of(loop.free_parameters)
     start = jnp.concatenate([batch.q0, batch.v0], axis=1)
     total, minimum = 0, None
     # Until the weights are known, a rough minimum is enough.
     worth = 1e-2
     for _ in range(20):
-        problem = Problem(
-            loop, batch, weights, free, bounds.lower, bounds.upper, signals, bool(free.any())
-        )
+        within = bounds.lower, bounds.upper
+        problem = Problem(loop, batch, weights, noise, free, *within, signals, bool(free.any()))
         left = method.max_steps - total
         minimum = minimise(problem, loop.theta, start, method.tolerance, worth, left, say)
         total += minimum.iterations
@@ -225,6 +234,16 @@ def _converge(
         weights, worth = new, 1e-4 if settled else worth
     assert minimum is not None
     return _Done(loop, pieces, batch, weights, free, minimum, signals, total)
+
+
+def _taps(filters: Sequence[ARFilter] | None, outputs: int) -> Float[np.ndarray, "outputs taps"]:
+    """Polynomials of noise filters, padded so that few lengths ever get compiled."""
+    longest = max((f.order for f in filters or ()), default=0)
+    taps = np.zeros((outputs, 16 * (longest // 16 + 1)))
+    taps[:, 0] = 1.0
+    for row, filt in zip(taps, filters or (), strict=False):
+        row[: filt.order + 1] = filt.polynomial
+    return taps
 
 
 def _new_weights(
@@ -255,7 +274,15 @@ def _too_coarse(done: _Done, recordings: Recordings) -> int | None:
     return min(64, int(np.ceil(now * (error.max() / 1e-4) ** 0.3)) + 1)
 
 
-def _report(method: OEM, done: _Done, recordings: Recordings, seconds: float) -> Fit:
+def _report(
+    method: OEM,
+    done: _Done,
+    recordings: Recordings,
+    seconds: float,
+    shown: AbstractMethod | None = None,
+    how: str | None = None,
+) -> Fit:
+    """The `Fit`; `shown` and `how` name a method that builds on this one, and its deviations."""
     found, mask = absorb_start(done.minimum.point.found, done.free), np.asarray(done.batch.kept)
     names = done.loop.names
     residuals = [np.asarray(found.residual)[k][mask[k]] for k in range(len(done.pieces))]
@@ -267,18 +294,19 @@ def _report(method: OEM, done: _Done, recordings: Recordings, seconds: float) ->
         information = sum(np.einsum("kop,koq->pq", j, j) for j in jacobians)
         meat = score_covariance(residuals, jacobians) if method.deviations == "sandwich" else None
         covariance, lost = determined_covariance(np.asarray(information), names, meat)
-    unweighted = [r / np.asarray(done.weights) for r in residuals]
+    raw, weights = np.asarray(found.raw), np.asarray(done.weights)
+    unweighted = [raw[k][mask[k]] / weights for k in range(len(done.pieces))]
     n = done.loop.joints
     measured = [getattr(piece, done.signals[0]) for piece in done.pieces]
     measured = compared(done.loop, done.pieces, measured)
     errors = [r[:, :n] for r in unweighted]
     measured, errors = _rejoin(recordings, done.pieces, measured, errors)
     notes = _at_bounds(done.loop)
-    how = {"sandwich": "sandwich estimate for coloured residuals", "white": "equation (A.1)"}
+    said = {"sandwich": "sandwich estimate for coloured residuals", "white": "equation (A.1)"}
     return Fit(
         done.loop,
         recordings,
-        method,
+        shown or method,
         done.minimum.status,
         covariance,
         tuple(errors),
@@ -286,7 +314,7 @@ def _report(method: OEM, done: _Done, recordings: Recordings, seconds: float) ->
         done.iterations,
         0,
         seconds,
-        how[method.deviations],
+        how or said[method.deviations],
         lost,
         tuple(notes),
     )
@@ -325,16 +353,18 @@ def score_covariance(
     """Covariance of J'r where residuals are coloured: their spectrum, weighed by J's.
 
     Each output's residuals are taken as one autoregressive process over all recordings, with the
-    order by AIC; outputs as uncorrelated.
+    order by AIC, but stronger in one recording than in another: noise that grows with the torque
+    is strongest where the derivatives are largest too. Outputs are taken as uncorrelated.
     """
     outputs, p = jacobians[0].shape[1:]
     meat = np.zeros((p, p))
     for o in range(outputs):
         series = [r[:, o] - r[:, o].mean() for r in residuals]
-        noise = fit_ar(series)
-        for j in jacobians:
+        strengths = [float(np.std(x)) or 1.0 for x in series]
+        noise = fit_ar([x / strength for x, strength in zip(series, strengths, strict=True)])
+        for j, strength in zip(jacobians, strengths, strict=True):
             size = 1 << int(np.ceil(np.log2(2 * j.shape[0])))
             wave = np.fft.fft(j[:, o], size, axis=0)
-            power = noise.spectrum(size)[:, None]
+            power = strength**2 * noise.spectrum(size)[:, None]
             meat += np.real(wave.conj().T @ (power * wave)) / size
     return meat

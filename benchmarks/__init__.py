@@ -1,0 +1,1 @@
+"""Benchmarks: each prints a table and takes --quick and --json FILE; run as python -m."""

@@ -1,0 +1,86 @@
+"""The measured double pendulum by three methods, beside its authors' values.
+
+python -m benchmarks.double_pendulum [--quick] [--json FILE]
+"""
+
+import dataclasses
+from pathlib import Path
+
+import pandas as pd
+
+import jaxid
+from jaxid.control import OpenLoop, Tracking
+
+from ._output import options, report
+
+DATA = Path(__file__).parents[1].parent / "shared" / "data" / "double_pendulum"
+LENGTH = 0.3
+WINDOW = 0.5
+# One low-pass for every method and recording, so that errors are of the same torque.
+CUTOFF = 8.0
+FILTERING = jaxid.Filtering(cutoff=CUTOFF, rate=50.0)
+COLUMNS = {
+    "time": "time",
+    "q": ["pos_meas1", "pos_meas2"],
+    "v": ["vel_meas1", "vel_meas2"],
+    "tau": ["tau_meas1", "tau_meas2"],
+}
+# Model 2.1 of Wiebe et al. 2024: m1 0.5594, r1 0.3, I1 0.05347, m2 0.6043, r2 0.1838, I2 0.02392.
+AUTHORS = {
+    "p1": 0.05347 + 0.6043 * LENGTH**2,
+    "p2": 0.02392,
+    "p4": 0.5594 * 0.3 + 0.6043 * LENGTH,
+    "p5": 0.6043 * 0.1838,
+}
+METHODS = {
+    "IDIM": (Tracking(cutoff=CUTOFF), jaxid.IDIM(filtering=FILTERING)),
+    "OEM, open loop": (OpenLoop(), jaxid.OEM(window=WINDOW)),
+    "OEM, tracking": (Tracking(cutoff=CUTOFF), jaxid.OEM()),
+}
+
+
+def recordings(*numbers: int) -> jaxid.Recordings:
+    """The measured trajectories of these numbers."""
+    files = [DATA / f"trajectory_0{k}.csv.gz" for k in numbers]
+    return jaxid.read(*files, columns=COLUMNS)
+
+
+def authors(fitting: jaxid.Recordings) -> jaxid.Fit:
+    """The authors' inertial values, with friction fitted as for the others, by IDIM."""
+    loop = jaxid.two_link(Tracking(cutoff=CUTOFF), link_length=LENGTH).hold(**AUTHORS)
+    return jaxid.fit(loop, fitting, jaxid.IDIM(filtering=FILTERING))
+
+
+def errors(loop: jaxid.ClosedLoop, unseen: jaxid.Recordings) -> dict[str, float]:
+    """Torque error when the recorded motion is tracked, position error over open-loop windows."""
+    tracking = dataclasses.replace(loop, controller=Tracking(cutoff=CUTOFF))
+    torque = jaxid.compare(tracking, unseen).error_percent.iloc[0]
+    driven = dataclasses.replace(loop, controller=OpenLoop())
+    position = jaxid.compare(driven, unseen, window=WINDOW).error_percent.iloc[0]
+    both = {"torque": torque, "position": position}
+    return {f"{what} {joint}, %": x for what, row in both.items() for joint, x in row.items()}
+
+
+def table(quick: bool = False) -> pd.DataFrame:
+    """One row for each method: parameters, error on recording 05, iterations, seconds."""
+    fitting, unseen = recordings(*((1,) if quick else (1, 2, 3))), recordings(5)
+    fits = {"authors": authors(fitting)}
+    for name, (law, method) in METHODS.items():
+        fits[name] = jaxid.fit(jaxid.two_link(law, link_length=LENGTH), fitting, method)
+    rows = {}
+    for name, found in fits.items():
+        values = {p.name: float(p.where(found.loop)) for p in found.loop.parameters}
+        kept = {k: x for k, x in values.items() if not k.startswith("gamma")}
+        took = {"iterations": found.iterations, "seconds": round(found.seconds, 1)}
+        rows[name] = kept | errors(found.loop, unseen) | took
+    return pd.DataFrame(rows).rename_axis("recording 05").T.rename_axis("method")
+
+
+def main() -> None:
+    """Prints the table."""
+    given = options(__doc__)
+    report(table(given.quick), given.json, 4)
+
+
+if __name__ == "__main__":
+    main()

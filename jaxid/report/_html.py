@@ -1,0 +1,82 @@
+"""HTML put together so that nothing from a file or a user gets in unescaped."""
+
+import html
+import math
+from collections.abc import Sequence
+
+import plotly.graph_objects as go
+
+
+class Markup(str):
+    """Text that is HTML already; every other string is escaped on its way in."""
+
+
+Content = str | int | float | None
+
+
+def tag(name: str, *content: Content, **attributes: str | None) -> Markup:
+    """An element; a trailing underscore in an attribute's name is dropped (`class_`)."""
+    words = [name]
+    for key, value in attributes.items():
+        if value is not None:
+            words.append(f'{key.rstrip("_").replace("_", "-")}="{html.escape(value)}"')
+    return Markup(f"<{' '.join(words)}>{join(*content)}</{name}>")
+
+
+def join(*content: Content) -> Markup:
+    """Pieces one after the other, escaped unless they are markup; None is left out."""
+    return Markup(
+        "".join(
+            piece if isinstance(piece, Markup) else html.escape(str(piece))
+            for piece in content
+            if piece is not None
+        )
+    )
+
+
+def table(
+    columns: Sequence[str], rows: Sequence[Sequence[Content]], caption: str | None = None
+) -> Markup:
+    """A table whose columns sort on a click; numbers are shown short and sorted in full."""
+    buttons = (tag("button", name, type="button") for name in columns)
+    head = tag("tr", *(tag("th", button, scope="col") for button in buttons))
+    body = [tag("tr", *(_cell(value) for value in row)) for row in rows]
+    title = None if caption is None else tag("caption", caption)
+    whole = tag("table", title, tag("thead", head), tag("tbody", *body))
+    # A wide table scrolls in its own box, so that a narrow page does not; the keyboard reaches it.
+    return tag("div", whole, class_="scroll", tabindex="0", role="region", aria_label=caption)
+
+
+def _cell(value: Content) -> Markup:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return tag("td", value if value is not None else "")
+    return tag("td", number(value), class_="number", data_value=repr(float(value)))
+
+
+def number(value: float) -> str:
+    """A number as one reads it: four digits, and a dash where there is none."""
+    if not math.isfinite(value):
+        return "–" if math.isnan(value) else ("∞" if value > 0 else "−∞")
+    return f"{value:.4g}".replace("-", "−")
+
+
+def probability(p: float) -> str:
+    """A p-value; one below what float64 holds is said to be small, not zero."""
+    return "< 1e−300" if p < 1e-300 else number(float(f"{p:.2g}"))
+
+
+def figure(drawn: go.Figure, caption: Content, wide: bool = False) -> Markup:
+    """A figure with its caption; a wide one scrolls on a narrow page."""
+    body = drawn.to_html(
+        full_html=False,
+        include_plotlyjs=False,
+        include_mathjax=False,
+        # More buttons than these lie over the legend on a narrow page.
+        config={
+            "responsive": True,
+            "displaylogo": False,
+            "modeBarButtons": [["toImage", "resetScale2d"]],
+        },
+    )
+    box = tag("div", Markup(body), class_="wide" if wide else "plot")
+    return tag("figure", tag("div", box, class_="scroll"), tag("figcaption", caption))

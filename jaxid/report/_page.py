@@ -1,0 +1,57 @@
+"""One file that opens without a network."""
+
+from importlib import resources
+from pathlib import Path
+
+from plotly.offline import get_plotlyjs
+
+from ..discovery import Discovery
+from ..errors import ModelError
+from ._html import Markup, join, tag
+from ._sections import body
+
+
+def write(story: Discovery, path: str | Path) -> Path:
+    """Writes a discovery as one self-contained HTML page.
+
+    **Arguments:**
+
+    - `story`: what `jaxid.discover` gave.
+    - `path`: the file to write; its folder must exist.
+
+    **Returns:** the path.
+
+    **Raises:** `ModelError` where the folder does not exist.
+    """
+    path = Path(path)
+    if not path.resolve().parent.is_dir():
+        raise ModelError(f"there is no folder {path.parent} to write {path.name} into: make it")
+    path.write_text(page(story), encoding="utf-8")
+    return path
+
+
+def page(story: Discovery) -> str:
+    """The page as text."""
+    meta = (
+        Markup('<meta charset="utf-8">'),
+        Markup('<meta name="viewport" content="width=device-width, initial-scale=1">'),
+        Markup('<meta name="color-scheme" content="light dark">'),
+        # What is not in the file is not fetched, whatever a browser extension or a figure tries.
+        Markup(
+            '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
+            "script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:\">"
+        ),
+    )
+    head = tag(
+        "head",
+        *meta,
+        tag("title", f"{story.loop.name}: {story.sentence}"),
+        tag("style", Markup(_part("page.css"))),
+        tag("script", Markup(get_plotlyjs())),
+    )
+    content = tag("body", tag("main", body(story)), tag("script", Markup(_part("page.js"))))
+    return f"<!doctype html>\n{tag('html', join(head, content), lang='en')}\n"
+
+
+def _part(name: str) -> str:
+    return (resources.files("jaxid.report") / name).read_text(encoding="utf-8")

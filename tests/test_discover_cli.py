@@ -1,0 +1,179 @@
+"""`jaxid discover` and `jaxid demo` on the bundled recordings, and what users get wrong."""
+
+import functools
+import json
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest import mock
+
+import pytest
+from typer.testing import CliRunner
+
+import jaxid
+import jaxid.discovery
+from jaxid.cli import app, spread
+
+DEMO = Path(jaxid.__file__).parent / "demo"
+HIDDEN = [str(DEMO / "hidden" / f"{name}.csv") for name in ("fit_1", "fit_2", "held_out")]
+
+
+class Told(NamedTuple):
+    """One run of the command: what it printed and wrote, and the story itself."""
+
+    output: str
+    exit_code: int
+    json: dict[str, Any]
+    page: Path
+    journal: Path
+    story: jaxid.Discovery
+
+
+@functools.cache
+def told() -> Told:
+    """The hidden set through the command, once for all tests of a process; tests/test_report too.
+
+    A fixture would be run once for each file that asks for it.
+    """
+    stories = []
+    real = jaxid.discovery.discover
+
+    def kept(*args, **settings):
+        stories.append(real(*args, **settings))
+        return stories[-1]
+
+    folder = Path(tempfile.mkdtemp(prefix="jaxid-story-"))
+    out = [folder / name for name in ("story.json", "story.html", "steps.json")]
+    options = ["--json", str(out[0]), "--report", str(out[1]), "--resume", str(out[2])]
+    with mock.patch.object(jaxid.discovery, "discover", kept):
+        # Two files after one --validate: the second is held out as well.
+        twin = folder / "other_day.csv"
+        twin.write_bytes(Path(HIDDEN[2]).read_bytes())
+        command = ["discover", *HIDDEN[:2], "--validate", HIDDEN[2], str(twin), *options]
+        result = CliRunner().invoke(app, command, catch_exceptions=False)
+    return Told(
+        result.output,
+        result.exit_code,
+        json.loads(out[0].read_text(encoding="utf-8")),
+        out[1],
+        out[2],
+        stories[0],
+    )
+
+
+@pytest.mark.slow
+def test_it_finds_the_hidden_effect_and_ends_well() -> None:
+    run = told()
+    assert run.exit_code == 0
+    assert run.output.startswith(f"{run.json['verdict']}: ")
+    first = run.json["added"][0]
+    assert (first["effect"], first["joint"]) == ("stribeck", 2)
+    # What tests/independent/demo.py hid: 0.08 N·m, gone at 0.4 rad/s.
+    assert first["parameters"]["level"]["value"] == pytest.approx(0.08, rel=0.1)
+    assert first["parameters"]["velocity"]["value"] == pytest.approx(0.4, rel=0.1)
+
+
+@pytest.mark.slow
+def test_the_error_on_unseen_recordings_falls_to_the_noise() -> None:
+    errors = told().json["error_percent"]
+    before, after = errors["before"]["validate"], errors["after"]["validate"]
+    assert after[1] < before[1] / 3
+    floor = told().json["noise_floor_percent"]
+    assert all(x < 1.2 * f for x, f in zip(after, floor, strict=True))
+
+
+@pytest.mark.slow
+def test_the_json_has_the_fields_of_its_page() -> None:
+    found = told().json
+    assert found["robot"] == "scara"
+    assert found["verdict"] in ("adequate", "explained", "outside_catalogue")
+    assert {"effect", "joint", "p_value", "predicted_error_percent"} <= set(found["ranking"][0])
+    assert len(found["ranking"][0]["predicted_error_percent"]) == 2
+    assert {"effect", "joint", "parameters", "indistinguishable"} <= set(found["added"][0])
+    assert set(found["added"][0]["parameters"]["level"]) == {"value", "std", "unit"}
+    assert all({"coordinate", "joint", "p_value"} <= set(d) for d in found["depends_on"])
+    assert bool(found["depends_on"]) == (found["verdict"] == "outside_catalogue")
+    for when in ("before", "after"):
+        assert [len(found["error_percent"][when][kind]) for kind in ("fit", "validate")] == [2, 2]
+    assert len(found["noise_floor_percent"]) == 2
+
+
+@pytest.mark.slow
+def test_several_held_out_files_follow_one_option() -> None:
+    assert told().story.steps[0].held_out.recordings.names == ("held_out", "other_day")
+
+
+@pytest.mark.slow
+def test_report_and_journal_are_written() -> None:
+    assert told().page.stat().st_size > 2**20
+    journal = json.loads(told().journal.read_text(encoding="utf-8"))
+    assert journal["added"][0]["effect"] == "Stribeck"
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("a --validate b c", "a --validate b --validate c"),
+        ("a b --validate c d --robot emps", "a b --validate c --validate d --robot emps"),
+        ("a --robot emps b --validate c d", "a --robot emps b --validate c --validate d"),
+        ("a --validate=b c --quiet", "a --validate=b --validate c --quiet"),
+        ("--validate b a", "--validate b a"),
+        ("--robot emps --validate b a", "--robot emps --validate b a"),
+        ("a --validate b -- c", "a --validate b -- c"),
+        ("a --validate", "a --validate"),
+    ],
+)
+def test_one_option_takes_several_files(given: str, meant: str) -> None:
+    valued = {"--validate", "--robot"}
+    assert spread(given.split(), "--validate", valued) == meant.split()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["absent.csv"], "there is no such file"),
+        ([HIDDEN[0], "--validate", HIDDEN[0]], "both to be fitted and held out"),
+        ([HIDDEN[0], "--robot", "kuka"], "there is no robot 'kuka'"),
+        ([HIDDEN[0], "--robot", "absent.py:loop"], "there is no file absent.py"),
+        ([HIDDEN[0], "--robot", "emps"], "has 2 joints, but the robot emps has 1"),
+        ([HIDDEN[0], "--json", "absent/story.json"], "there is no folder absent"),
+        ([HIDDEN[0], "--report", "absent/story.html"], "there is no folder absent"),
+        ([HIDDEN[0], "--column", "q"], "has no '='"),
+        ([HIDDEN[0], "--unit", "q=parsec"], "is not a unit known for q"),
+        ([HIDDEN[0], "--controller", "fuzzy"], "there is no controller 'fuzzy'"),
+    ],
+)
+def test_a_users_error_is_one_sentence(
+    options: list[str], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["discover", *options])
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert says in result.stderr
+    assert result.stderr.startswith("jaxid: ")
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_without_recordings_it_says_what_is_missing() -> None:
+    result = CliRunner().invoke(app, ["discover"])
+    assert result.exit_code == 2
+    assert "Missing argument" in result.stderr
+
+
+def test_an_interrupt_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def interrupted(*args, **settings):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jaxid.discovery, "discover", interrupted)
+    steps = tmp_path / "steps.json"
+    result = CliRunner().invoke(app, ["discover", HIDDEN[0], "--resume", str(steps)])
+    assert result.exit_code == 130
+    assert f"goes on from the steps in {steps}" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_help_shows_examples() -> None:
+    result = CliRunner().invoke(app, ["discover", "--help"])
+    assert result.exit_code == 0
+    assert "jaxid discover fit_1.csv fit_2.csv --validate held_out.csv" in result.stdout

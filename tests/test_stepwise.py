@@ -1,0 +1,76 @@
+"""The baseline of the blind bench: stepwise regression on filtered derivatives."""
+
+import sys
+from pathlib import Path
+
+import independent as sim
+import numpy as np
+import pytest
+from independent import effects as fx
+
+import jaxid
+
+# The benchmarks are no part of the package: they lie beside the tests in a checkout.
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks import stepwise
+
+QUIET = sim.Noise(level=0.002)
+
+
+def recordings(*effects: fx.Effect, noise: sim.Noise = QUIET) -> jaxid.Recordings:
+    case = sim.make_case(7, effects, noise, duration=10.0)
+    return jaxid.Recordings.of(
+        [
+            jaxid.Recording.from_arrays(r["time"], r["q"], r["tau"], q_ref=r["q_ref"], name=name)
+            for name, r in case.recordings.items()
+            if name != "held_out"
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        fx.Stribeck(2, 0.1, 0.3),
+        fx.TorqueOffset(1, 0.6),
+        fx.DriveGain(2, 0.3),
+        fx.EncoderEccentricity(2, 0.05, 1.0),
+        fx.Gravity(0.3, 0.2, 3.0),
+    ],
+    ids=lambda e: e.name,
+)
+def test_large_effect_enters_first(effect):
+    found = stepwise.first_effect(jaxid.scara(), recordings(effect))
+    assert found == (effect.name, effect.joint)
+
+
+def test_nothing_enters_where_nothing_is_allowed_to():
+    assert stepwise.first_effect(jaxid.scara(), recordings(), p_to_enter=0.0) is None
+
+
+def test_selection_stops_at_the_given_number():
+    entered = stepwise.select(jaxid.scara(), recordings(fx.Spring(2, 0.1, 0.2)), most=2)
+    assert 1 <= len(entered) <= 2
+    assert entered[0].key == ("spring", 2)
+
+
+def test_basis_is_orthonormal_and_beside_the_other():
+    rng = np.random.default_rng(0)
+    base = stepwise._basis(rng.standard_normal((50, 3)))
+    block = np.column_stack([base @ [1.0, 2.0, 3.0], rng.standard_normal(50)])
+    own = stepwise._basis(block, base)
+    # The first column lies in the base already.
+    assert own.shape == (50, 1)
+    # Rounding of 50 products of order one.
+    assert np.abs(base.T @ own).max() < 1e-13
+    assert own.T @ own == pytest.approx(1.0, abs=1e-13)
+
+
+def test_delay_column_is_the_torque_less_the_late_one():
+    time = np.linspace(0, 1, 101)
+    tau = np.column_stack([np.sin(time), np.cos(time)])
+    column = stepwise._late(jaxid.effects.TimeDelay(joint=2, delay=0.02), time, tau)
+    # The delay is two samples, where interpolation is exact.
+    assert column[2:, 1, 0] == pytest.approx(tau[2:, 1] - tau[:-2, 1], abs=1e-12)
+    assert not column[:, 0].any()
