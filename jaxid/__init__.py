@@ -10,9 +10,11 @@ from . import effects as effects  # noqa: E402
 from .discovery import Comparison as Comparison  # noqa: E402
 from .discovery import Diagnosis as Diagnosis  # noqa: E402
 from .discovery import Discovery as Discovery  # noqa: E402
+from .discovery import Limits as Limits  # noqa: E402
 from .discovery import compare as compare  # noqa: E402
 from .discovery import diagnose as diagnose  # noqa: E402
 from .discovery import discover as discover  # noqa: E402
+from .discovery import next_experiment as next_experiment  # noqa: E402
 from .effects import Curve as Curve  # noqa: E402
 from .effects import catalogue as catalogue  # noqa: E402
 from .estimate import DIDIM as DIDIM  # noqa: E402

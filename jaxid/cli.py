@@ -25,6 +25,9 @@ app = typer.Typer(
     help="Identify robot arms from closed-loop recordings, and find the effect the model lacks.",
 )
 
+# What shells give for a command that Ctrl-C ended.
+INTERRUPTED = 130
+
 Files = Annotated[list[Path], typer.Argument(help="Recordings: .csv, .parquet, .mat or .npz.")]
 Robot = Annotated[
     str, typer.Option(help="scara, two-link, emps, or FILE.py:NAME for a loop of your own.")
@@ -162,7 +165,7 @@ def _sentences(on_interrupt: str = "") -> Iterator[None]:
             raise typer.Exit(2) from None
         except KeyboardInterrupt:
             typer.echo(f"\njaxid: interrupted{on_interrupt}", err=True)
-            raise typer.Exit(130) from None
+            raise typer.Exit(INTERRUPTED) from None
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *where: Any) -> None:
@@ -416,4 +419,13 @@ def main() -> None:
     # Where there is no home or it cannot be written, each run compiles for itself.
     with contextlib.suppress(OSError, RuntimeError):
         _keep_programs()
-    app()
+    try:
+        app()
+    except SystemExit as ended:
+        if ended.code == INTERRUPTED:
+            # A compilation may be on its way in a thread of XLA's, which taking the interpreter
+            # down under it makes abort.
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(INTERRUPTED)
+        raise

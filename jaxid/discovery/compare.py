@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from .. import figures
 from ..control import OpenLoop
+from ..effects import PeriodicDisturbance
 from ..errors import FitError, RecordingError
 from ..estimate import Filtering, Fit
 from ..estimate._base import errors_to_dict, joint_columns, relative_errors
@@ -90,6 +91,16 @@ class Comparison(eqx.Module):
                 f"{', '.join(self.recordings.names)}"
             )
         return self.recordings.names.index(recording)
+
+    def where(self) -> pd.DataFrame:
+        """On which coordinates the residuals depend: p-values corrected for their number, shares.
+
+        Free-form curves of every coordinate and tones are held against the whitened residuals,
+        what the model's own parameters can absorb taken off.
+        """
+        from .diagnose import diagnose
+
+        return diagnose(self, catalogue=(PeriodicDisturbance,), progress=False).where_table()
 
     def plot(self, recording: int | str = 0) -> go.Figure:
         """Measured, simulated and residual of one recording, with the residual's autocorrelation.

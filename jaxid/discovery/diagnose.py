@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ import plotly.graph_objects as go
 from jaxtyping import Float
 
 from .. import figures
-from ..effects import AbstractEffect, Curve, Scene
+from ..effects import AbstractEffect, Curve, Motion, Scene
 from ..effects import catalogue as known
 from ..errors import FitError, ModelError
 from ..estimate import OEM, Fit
@@ -23,6 +24,7 @@ from ..parameters import write_values
 from ..progress import working
 from ..recording import Recordings
 from ..simulate import Batch, prepare, with_substeps
+from .compare import Comparison
 from .linear import Linearised, base_columns, linearise
 from .score import (
     Data,
@@ -66,7 +68,7 @@ class Diagnosis(eqx.Module):
     - `noise`: the noise filter of each output.
     """
 
-    fit: Fit
+    fit: Fit | Comparison
     ranking: tuple[Verdict, ...]
     forms: tuple[Verdict, ...]
     where: tuple[Verdict, ...]
@@ -74,6 +76,7 @@ class Diagnosis(eqx.Module):
     data: Data
     gram: Gram
     scene: Scene
+    motion: Motion
     floor: Float[np.ndarray, "recordings joints"]
     tests: float
     significance: float = 0.01
@@ -217,6 +220,47 @@ class Diagnosis(eqx.Module):
         unit = self.fit.loop.arm.units()[0][joint - 1]
         return figures.shares_in_time(time, residual, shares, unit=unit)
 
+    def plot_where(self, place: int = 0, recording: int = 0) -> go.Figure:
+        """The residual against a coordinate on which it depends, with the fitted curve.
+
+        **Arguments:**
+
+        - `place`: in `where`, 0 for the strongest. `recording`: number from 0.
+        """
+        verdict = self.where[place]
+        curve = self.predicted(verdict)
+        assert isinstance(curve, Curve)
+        motion = self.motion
+        x = np.asarray(motion.t if curve.coordinate == "t" else getattr(motion, curve.coordinate))
+        x = x[recording] if curve.coordinate == "t" else x[recording, :, curve.of - 1]
+        residual = self.data.residual[recording, :, (curve.joint or 1) - 1]
+        if len(x) != len(residual):
+            x = np.interp(np.linspace(0, 1, len(residual)), np.linspace(0, 1, len(x)), x)
+        keep = self.data.mask[recording]
+        grid = np.linspace(float(curve.low), float(curve.high), 200)
+        basis = np.asarray(jax.vmap(curve.basis)(jnp.asarray(grid)))
+        values, covariance = self.gram.amplitude(verdict.hypothesis.columns)
+        band = 2 * np.sqrt(np.maximum(np.einsum("gk,kl,gl->g", basis, covariance, basis), 0))
+        torque, position = self.fit.loop.arm.units()
+        unit = {
+            "q": position[curve.of - 1],
+            "v": f"{position[curve.of - 1]}/s",
+            "a": f"{position[curve.of - 1]}/s²",
+            "tau": torque[curve.of - 1],
+            "t": "s",
+        }[curve.coordinate]
+        return figures.curve_fit(
+            x[keep],
+            residual[keep],
+            curve.label,
+            unit,
+            torque[curve.joint - 1],
+            grid,
+            basis @ values,
+            band,
+            y_name=f"residual of joint {curve.joint}",
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """The ranking and where the model fails, as plain JSON."""
         return {
@@ -233,6 +277,12 @@ class Diagnosis(eqx.Module):
             "depends_on": self.depends_on(),
             "noise_floor_percent": self.floor_percent().tolist(),
         }
+
+    def next_experiment(self, **settings: Any) -> Any:
+        """The reference that would tell look-alikes apart: see `jaxid.next_experiment`."""
+        from .experiment import next_experiment
+
+        return next_experiment(self, **settings)
 
     def depends_on(self) -> list[dict[str, Any]]:
         """Coordinates on which a significant part of the residual depends, best first."""
@@ -269,7 +319,7 @@ def _label(verdict: Verdict) -> str:
     return verdict.hypothesis.name + ("" if joint is None else f", joint {joint}")
 
 
-def total_percent(fit: Fit) -> Float[np.ndarray, " joints"]:
+def total_percent(fit: Fit | Comparison) -> Float[np.ndarray, " joints"]:
     """Relative error of a fit over all its recordings together, %."""
     table = fit.error_percent.to_numpy()
     error = np.stack([np.linalg.norm(r, axis=0) for r in fit.residuals])
@@ -278,7 +328,7 @@ def total_percent(fit: Fit) -> Float[np.ndarray, " joints"]:
 
 
 def diagnose(
-    fit: Fit,
+    fit: Fit | Comparison,
     *,
     catalogue: Sequence[Any] = known,
     significance: float = 0.01,
@@ -291,7 +341,7 @@ def diagnose(
 
     **Arguments:**
 
-    - `fit`: of a loop that is simulated (by `OEM`, `DIDIM` or `IDIM`).
+    - `fit`: of a loop that can be simulated; or a comparison of a loop with recordings.
     - `catalogue`: effect classes, effects, or functions from a `Scene` to effects; for instance
       `(*jaxid.catalogue, Mine)`.
     - `significance`: corrected p-value below which something counts as missing.
@@ -317,12 +367,13 @@ def diagnose(
         hypotheses, table = signatures(loop, batch, linear, proposed, row, say)
         data = Data(residual, base, _at_samples(batch, table), np.asarray(batch.kept))
         say(f"scoring {len(hypotheses)} hypotheses")
-        return _judge(fit, data, hypotheses, scene, significance)
+        return _judge(fit, data, hypotheses, scene, linear.motion, significance)
 
 
-def _as_fitted(fit: Fit, loop: ClosedLoop) -> tuple[str, Batch, np.ndarray]:
+def _as_fitted(fit: Fit | Comparison, loop: ClosedLoop) -> tuple[str, Batch, np.ndarray]:
     """Which output is compared, the batch, and which initial states are free, as in the fit."""
-    method = getattr(fit.method, "oem", fit.method)
+    method = getattr(fit, "method", None)
+    method = getattr(method, "oem", method)
     method = method if isinstance(method, OEM) else OEM()
     pieces = pieces_of(fit.recordings, method.window)
     batch = prepare(loop, pieces)
@@ -389,10 +440,11 @@ def _tones(
 
 
 def _judge(
-    fit: Fit,
+    fit: Fit | Comparison,
     data: Data,
     hypotheses: list[Hypothesis],
     scene: Scene,
+    motion: Motion,
     significance: float,
 ) -> Diagnosis:
     blocks = [h.columns for h in hypotheses]
@@ -420,6 +472,7 @@ def _judge(
         data,
         gram,
         scene,
+        motion,
         _floor(fit, data, leftover(data, noise, columns, 1e-9), len(columns)),
         tests,
         significance,
@@ -457,7 +510,7 @@ def _within_bounds(gram: Gram, hypothesis: Hypothesis) -> bool:
 
 
 def _floor(
-    fit: Fit, data: Data, rest: np.ndarray, lost: int
+    fit: Fit | Comparison, data: Data, rest: np.ndarray, lost: int
 ) -> Float[np.ndarray, "recordings joints"]:
     """Relative error by recording and joint of noise alone, what the model took of it put back."""
     outputs = data.residual.shape[2]

@@ -171,6 +171,7 @@ def errors_to_dict(errors: pd.DataFrame) -> dict[str, list[float | None]]:
 def determined_covariance(
     information: Float[np.ndarray, "parameters parameters"],
     names: Sequence[str],
+    scales: Float[np.ndarray, " parameters"],
     meat: Float[np.ndarray, "parameters parameters"] | None = None,
 ) -> tuple[Float[np.ndarray, "parameters parameters"], tuple[str, ...]]:
     """The inverse of an information matrix, and what the data say nothing about.
@@ -178,10 +179,15 @@ def determined_covariance(
     **Arguments:**
 
     - `information`: J'J of the weighted residuals.
-    - `names`: of its rows.
+    - `names`: of its rows. `scales`: typical sizes of these parameters.
     - `meat`: covariance of the score where it is not `information`; gives the sandwich.
     """
     size = np.sqrt(np.maximum(np.diag(information), 0))
+    # Ten thousand times a parameter's usual size without a trace in the signals: its column is
+    # what rounding left of a motion that was not made.
+    heard = size * scales > 1e-4
+    size = np.where(heard, size, 0.0)
+    information = information * np.outer(heard, heard)
     floor = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(information / np.outer(floor, floor))
     # Columns have unit length, so that rounding stands at 1e-16 and a direction below 1e-11 is

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ..errors import FitError
 from ..loop import ClosedLoop
-from ..parameters import write_values
+from ..parameters import Bounds, write_values
 from ..recording import Recordings
 from ._base import AbstractMethod, Fit, Status, determined_covariance, relative_errors
 from ._regression import Filtering, decimator, filtered, linear_parameters, regression
@@ -23,6 +23,7 @@ class Stacked(eqx.Module):
 
     columns: Float[np.ndarray, "samples joints parameters"]
     right: Float[np.ndarray, "samples joints"]
+    scales: Float[np.ndarray, " parameters"]
     lengths: tuple[int, ...] = eqx.field(static=True)
 
     def split(self, rows: Float[np.ndarray, "samples joints"]) -> list[np.ndarray]:
@@ -48,7 +49,9 @@ def stack(loop: ClosedLoop, recordings: Recordings, filtering: Filtering, motion
         reduce = decimator(recording, filtering)
         columns.append(reduce(wide))
         rights.append(reduce(right))
-    return Stacked(np.concatenate(columns), np.concatenate(rights), tuple(len(r) for r in rights))
+    scales = np.asarray(Bounds.of(linear_parameters(loop)).scale)
+    lengths = tuple(len(r) for r in rights)
+    return Stacked(np.concatenate(columns), np.concatenate(rights), scales, lengths)
 
 
 class Solved(eqx.Module):
@@ -102,10 +105,10 @@ def solve(
     variance = sigma**2 * stacked.right.shape[0] / count
     information = wide.T @ wide / variance
     if instruments is None:
-        covariance, lost = determined_covariance(information, names)
+        covariance, lost = determined_covariance(information, names, stacked.scales)
     else:
         cross = np.linalg.pinv(tools.T @ wide)
-        _, lost = determined_covariance(information, names)
+        _, lost = determined_covariance(information, names, stacked.scales)
         covariance = variance * cross @ (tools.T @ tools) @ cross.T
     return Solved(theta, covariance, residual, lost)
 

@@ -292,8 +292,9 @@ def _report(
         covariance, lost = np.full((p, p), np.inf), ()
     else:
         information = sum(np.einsum("kop,koq->pq", j, j) for j in jacobians)
+        scales = np.asarray(Bounds.of(done.loop.free_parameters).scale)
         meat = score_covariance(residuals, jacobians) if method.deviations == "sandwich" else None
-        covariance, lost = determined_covariance(np.asarray(information), names, meat)
+        covariance, lost = determined_covariance(np.asarray(information), names, scales, meat)
     raw, weights = np.asarray(found.raw), np.asarray(done.weights)
     unweighted = [raw[k][mask[k]] / weights for k in range(len(done.pieces))]
     n = done.loop.joints

@@ -1,0 +1,211 @@
+"""What to record next, so that effects which look alike can be told apart."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+import plotly.graph_objects as go
+from jaxtyping import Float
+
+from .. import figures
+from ..effects import AbstractTransmission
+from ..errors import FitError
+from ..loop import ClosedLoop
+from ..recording import Recording
+from ..simulate import prepare, with_substeps
+from .diagnose import Diagnosis, Verdict, _at_samples
+from .linear import base_columns, linearise
+from .score import Data, Gram, gram_of
+from .signatures import signatures
+
+
+class Limits(eqx.Module):
+    """What a reference and its motion may not exceed, one value a joint, in SI units.
+
+    - `low`, `high`: of position. `speed`, `acceleration`, `torque`: magnitudes.
+    """
+
+    low: Float[np.ndarray, " joints"]
+    high: Float[np.ndarray, " joints"]
+    speed: Float[np.ndarray, " joints"]
+    acceleration: Float[np.ndarray, " joints"]
+    torque: Float[np.ndarray, " joints"]
+
+    @classmethod
+    def of(cls, diagnosis: Diagnosis) -> "Limits":
+        """What the recordings at hand have reached."""
+        scene, recordings = diagnosis.scene, diagnosis.fit.recordings
+        asked = [r.q if r.q_ref is None else r.q_ref for r in recordings]
+        speed, acceleration = [], []
+        for q, r in zip(asked, recordings, strict=True):
+            v = np.gradient(q, r.time, axis=0)
+            speed.append(np.abs(v).max(axis=0))
+            acceleration.append(np.abs(np.gradient(v, r.time, axis=0)).max(axis=0))
+        return cls(
+            scene.q_low,
+            scene.q_high,
+            np.max(speed, axis=0),
+            np.max(acceleration, axis=0),
+            scene.torque,
+        )
+
+
+class Experiment(eqx.Module):
+    """A reference to record next.
+
+    - `recording`: its `time` and `q_ref`; `q` and `tau` are what the model expects.
+    - `now`, `then`: whitened squared error by which the effects differ, on the recordings at hand
+      and on the proposed one; ten is decisive.
+    """
+
+    recording: Recording
+    effects: tuple[str, ...] = eqx.field(static=True)
+    now: float
+    then: float
+
+    def plot(self) -> go.Figure:
+        """The reference in time."""
+        r = self.recording
+        assert r.q_ref is not None
+        panels = [
+            [figures.Trace(f"joint {j}", column, "rad", "reference")]
+            for j, column in enumerate(r.q_ref.T, start=1)
+        ]
+        return figures.signals(r.time, panels)
+
+    def __repr__(self) -> str:
+        return (
+            f"a reference of {self.recording.duration:.0f} s that sets "
+            f"{' and '.join(self.effects)} apart by {self.then:.3g} in whitened squared error; the recordings at hand do by "
+            f"{self.now:.3g} (ten is decisive)"
+        )
+
+
+def next_experiment(
+    diagnosis: Diagnosis,
+    effects: Sequence[Verdict] | None = None,
+    *,
+    limits: Limits | None = None,
+    duration: float = 20.0,
+    tries: int = 24,
+    seed: int = 0,
+) -> Experiment:
+    """Proposes a reference on which effects that look alike differ most.
+
+    Multi-sines are drawn, scaled into the limits and simulated; the best is returned.
+
+    **Arguments:**
+
+    - `effects`: two or more entries of the ranking; by default the leader and what looks like it.
+      One alone asks for the reference that determines its amplitude best.
+    - `limits`: by default what the recordings at hand have reached.
+    - `duration`: s. `tries`: how many references are drawn.
+
+    **Raises:** `FitError` where nothing can be compared, or no reference keeps within the limits.
+    """
+    chosen = list(effects) if effects is not None else _group(diagnosis)
+    # A transmission's signature is a simulation of its own, too slow to repeat for each reference.
+    chosen = [v for v in chosen if not isinstance(v.hypothesis.effect, AbstractTransmission)]
+    if not chosen:
+        raise FitError("there is no effect whose signature can be predicted on another reference")
+    bounds = Limits.of(diagnosis) if limits is None else limits
+    loop = with_substeps(diagnosis.fit.loop, diagnosis.fit.recordings)
+    period = float(np.median([r.period for r in diagnosis.fit.recordings]))
+    drawn = [
+        _draw(bounds, duration, period, np.random.default_rng([seed, k])) for k in range(tries)
+    ]
+    scores, runs = _separations(loop, drawn, chosen, diagnosis, bounds)
+    if not np.isfinite(scores).any():
+        raise FitError(
+            "none of the references drawn keeps the motion within the limits of torque: raise "
+            "limits.torque, or lower limits.speed"
+        )
+    best = int(np.nanargmax(np.where(np.isfinite(scores), scores, np.nan)))
+    names = tuple(v.hypothesis.name for v in chosen)
+    columns = [list(v.hypothesis.columns) for v in chosen]
+    now = _apart(diagnosis.gram, columns, [diagnosis.gram.amplitude(c)[0] for c in columns])
+    return Experiment(runs[best], names, now, float(scores[best]))
+
+
+def _group(diagnosis: Diagnosis) -> list[Verdict]:
+    if not diagnosis.ranking:
+        raise FitError("nothing was screened, so there is nothing to tell apart")
+    leader = diagnosis.ranking[0]
+    return [leader, *diagnosis.alike(leader, within=30.0)][:3]
+
+
+def _draw(limits: Limits, duration: float, period: float, rng: np.random.Generator) -> Recording:
+    """A multi-sine from rest, as large as the limits let it be."""
+    time = np.arange(round(duration / period) + 1) * period
+    ramp = np.clip(time / min(2.0, duration / 5), 0, 1)
+    ramp = ramp**3 * (10 - 15 * ramp + 6 * ramp**2)
+    columns = []
+    for j in range(len(limits.low)):
+        top = rng.uniform(0.3, 1.0) * limits.acceleration[j] / max(limits.speed[j], 1e-9) / np.pi
+        f = rng.uniform(0.05, max(top, 0.1), 6)
+        wave = np.sin(2 * np.pi * np.outer(time, f) + rng.uniform(0, 2 * np.pi, 6))
+        x = wave @ rng.normal(size=6)
+        x = (x - x[0]) * ramp
+        v = np.gradient(x, period)
+        a = np.gradient(v, period)
+        span = limits.high[j] - limits.low[j]
+        scale = min(
+            span / max(np.ptp(x), 1e-12),
+            limits.speed[j] / max(np.abs(v).max(), 1e-12),
+            limits.acceleration[j] / max(np.abs(a).max(), 1e-12),
+        )
+        x = scale * x
+        # Somewhere within the limits, since what an effect shows may depend on where.
+        low, high = limits.low[j] - x.min(), limits.high[j] - x.max()
+        columns.append(x + rng.uniform(min(low, high), max(low, high)))
+    q_ref = np.stack(columns, axis=1)
+    return Recording(time, q_ref, np.ones_like(q_ref), q_ref=q_ref, name="next")
+
+
+def _separations(
+    loop: ClosedLoop,
+    drawn: Sequence[Recording],
+    chosen: Sequence[Verdict],
+    diagnosis: Diagnosis,
+    limits: Limits,
+) -> tuple[Float[np.ndarray, " tries"], list[Recording]]:
+    """How far apart the effects are on each reference; not a number where a limit is passed."""
+    batch = prepare(loop, drawn)
+    linear = linearise(loop, batch, "tau")
+    proposed = [(v.hypothesis.effect, 1.0) for v in chosen]
+    hypotheses, table = signatures(loop, batch, linear, proposed, 0, lambda text: None)
+    base = _at_samples(batch, np.asarray(base_columns(linear, loop.theta.shape[0], False)))
+    rows = _at_samples(batch, table)
+    seen = _at_samples(batch, np.asarray(linear.seen))
+    columns = [list(h.columns) for h in hypotheses]
+    sizes = [diagnosis.gram.amplitude(v.hypothesis.columns)[0] for v in chosen]
+    scores, runs = np.full(len(drawn), np.nan), []
+    for k, recording in enumerate(drawn):
+        tau, q = seen[k, :, 0], seen[k, :, 1]
+        runs.append(Recording(recording.time, q, tau, q_ref=recording.q_ref, name=recording.name))
+        if not np.isfinite(seen[k]).all() or np.any(np.abs(tau) > 1.05 * limits.torque):
+            continue
+        data = Data(
+            np.zeros_like(tau)[None], base[k : k + 1], rows[k : k + 1], np.ones((1, len(tau)), bool)
+        )
+        scores[k] = _apart(gram_of(data, diagnosis.noise), columns, sizes)
+    return scores, runs
+
+
+def _apart(gram: Gram, columns: Sequence[Sequence[int]], amplitudes: Sequence[np.ndarray]) -> float:
+    """How decisively the first effect and the nearest other differ, whichever of them is true.
+
+    What is left of one, at its amplitude, that the other cannot imitate; the larger of both ways,
+    since an effect that is a special case of another is always imitated by it.
+    """
+
+    def left(one: int, other: Sequence[int]) -> float:
+        own = list(columns[one])
+        size = amplitudes[one] * gram.size[own]
+        rest = gram.without(list(other)) if len(other) else gram
+        return float(size @ rest.gram[np.ix_(own, own)] @ size)
+
+    if len(columns) == 1:
+        return left(0, [])
+    others = range(1, len(columns))
+    return min(max(left(0, columns[k]), left(k, columns[0])) for k in others)
