@@ -19,7 +19,7 @@ from ._output import options, report
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-import independent as sim  # noqa: E402
+import independent as sim
 
 DRAWS = 20
 FIRST_SEED = 100

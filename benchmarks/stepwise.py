@@ -16,6 +16,7 @@ from scipy import stats
 
 import jaxid
 from jaxid import effects as fx
+from jaxid.errors import FitError
 from jaxid.estimate._regression import decimator, filtered, regression
 from jaxid.loop import inverse
 from jaxid.parameters import list_parameters, read_values, write_values
@@ -105,9 +106,19 @@ def _basis(columns: np.ndarray, beside: np.ndarray | None = None) -> np.ndarray:
 # --- the regression ------------------------------------------------------------------------------
 
 
+def settle(recordings: jaxid.Recordings) -> jaxid.Filtering:
+    """The filter by the spectra's own cutoffs; at a tenth of the rate where these are too low."""
+    try:
+        for recording in recordings:
+            jaxid.Filtering().settled(recording)
+    except FitError:
+        return jaxid.Filtering(cutoff=min(r.rate for r in recordings) / 10)
+    return jaxid.Filtering()
+
+
 def assemble(loop: jaxid.ClosedLoop, recordings: jaxid.Recordings) -> Rows:
     """Base and candidate columns along the filtered motion, all filtered alike and decimated."""
-    filtering = jaxid.Filtering()
+    filtering = settle(recordings)
     reducers = [decimator(r, filtering) for r in recordings]
     motions = [filtered(r, filtering) for r in recordings]
     bases, rights = [], []
@@ -172,6 +183,7 @@ def survey(
         tuple(float(x) for x in loop.arm.link_lengths()),
         float(loop.arm.gravity()),
         tuple(loop.arm.prismatic()),
+        tuple(loop.arm.first_moments()),
     )
 
 

@@ -5,7 +5,11 @@ import importlib.util
 import json
 import math
 import os
+import signal
+import socket
 import sys
+import threading
+import time
 import warnings
 from collections.abc import Iterator
 from importlib import resources
@@ -156,6 +160,7 @@ def _sentences(on_interrupt: str = "") -> Iterator[None]:
 
     - `on_interrupt`: what else to say then.
     """
+    _farewell[0] = on_interrupt
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:
@@ -182,7 +187,7 @@ def fit(
     column: Column = None,
     unit: Unit = None,
     controller: Controller = None,
-    method: Annotated[str, typer.Option(help="oem, idim, idim-iv or didim.")] = "oem",
+    method: Annotated[str, typer.Option(help="oem, pem, idim, idim-iv or didim.")] = "oem",
     window: Annotated[
         float | None, typer.Option(help="Simulate pieces of this length on their own, s.")
     ] = None,
@@ -196,6 +201,7 @@ def fit(
     with _sentences():
         methods = {
             "oem": lambda: estimate.OEM(window=window),
+            "pem": lambda: estimate.SeparablePEM(estimate.OEM(window=window)),
             "idim": estimate.IDIM,
             "idim-iv": estimate.IDIMIV,
             "didim": estimate.DIDIM,
@@ -414,18 +420,48 @@ def _keep_programs() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
+# What an interrupt says beside that it was one; a command in progress sets it.
+_farewell = [""]
+
+
+def _leave_on_interrupt() -> None:
+    """Ends the process a second after Ctrl-C if the main thread has not: it may be compiling.
+
+    Python's own handler waits for the compiler to return, which takes up to a minute. Files are
+    written under another name first, so that none is left half done.
+    """
+    ours, theirs = socket.socketpair()
+    theirs.setblocking(False)
+    signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
+
+    def watch() -> None:
+        while signal.SIGINT not in ours.recv(64):
+            pass
+        time.sleep(1.0)
+        typer.echo(f"\njaxid: interrupted{_farewell[0]}", err=True)
+        theirs.close()
+        _leave()
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _leave() -> None:
+    # A compilation may be on its way in a thread of XLA's; taking the interpreter down under it
+    # makes it abort.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(INTERRUPTED)
+
+
 def main() -> None:
     """Entry point of the `jaxid` command."""
     # Where there is no home or it cannot be written, each run compiles for itself.
     with contextlib.suppress(OSError, RuntimeError):
         _keep_programs()
+    _leave_on_interrupt()
     try:
         app()
     except SystemExit as ended:
         if ended.code == INTERRUPTED:
-            # A compilation may be on its way in a thread of XLA's, which taking the interpreter
-            # down under it makes abort.
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(INTERRUPTED)
+            _leave()
         raise

@@ -239,8 +239,8 @@ def band_of(loop: ClosedLoop, recordings: Recordings | Sequence[Recording]) -> B
 def compared(
     loop: ClosedLoop,
     recordings: Recordings | Sequence[Recording],
-    signals: Sequence[Float[np.ndarray, "samples_ joints"]],
-) -> list[Float[np.ndarray, "kept_ joints"]]:
+    signals: Sequence[Float[np.ndarray, "_samples joints"]],
+) -> list[Float[np.ndarray, "_samples joints"]]:
     """What of signals the controller lets compare, `(samples, joints)` for each recording.
 
     **Arguments:**

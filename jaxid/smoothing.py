@@ -1,5 +1,7 @@
 """Zero-phase low-passes: how far up a recorded motion is signal, and the filter that keeps it."""
 
+import itertools
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -24,9 +26,10 @@ def low_pass(
     """
     sections = signal.butter(order, cutoff, fs=rate, output="sos")
     # SciPy's own choice of padding is shorter than the filter remembers, and then a signal that
-    # moves at its end is bent there.
+    # moves at its end is bent there. A straight line would pass unchanged, so it need not pass.
     pad = min(len(x) - 1, int(np.ceil(4 * rate / cutoff)))
-    return signal.sosfiltfilt(sections, x, axis=0, padlen=pad)
+    line = np.linspace(x[0], x[-1], len(x))
+    return line + signal.sosfiltfilt(sections, x - line, axis=0, padlen=pad)
 
 
 def even_times(recording: Recording) -> Float[np.ndarray, " samples"]:
@@ -57,28 +60,34 @@ def signal_cutoff(recording: Recording) -> float:
     """The frequency in Hz above which a recorded motion says no more about acceleration.
 
     The spectrum of the acceleration, f⁴ times that of position, falls until the encoder's noise
-    lifts it again: where it first comes within a factor two of its lowest point, all joints
-    together, each relative to its speed. At most an eighth of the sample rate; a tenth where the
-    recording is too short for a spectrum.
+    lifts it again: its lowest point, all joints together, each relative to its speed. At least
+    five times where speed is strongest, at most an eighth of the sample rate; a tenth of that where
+    the recording is too short for a spectrum.
     """
     n, rate = recording.samples, recording.rate
     if n < 200:
         return rate / 10
     q = signal.detrend(resampled(recording.time, recording.q, even_times(recording)), axis=0)
     # A window whose side lobes stay below the noise, for the motion is 10¹⁰ times as strong.
-    power = np.abs(np.fft.rfft(q * signal.windows.blackmanharris(n)[:, None], axis=0)) ** 2
+    power = (
+        np.abs(np.fft.rfft(q * np.asarray(signal.get_window("blackmanharris", n))[:, None], axis=0))
+        ** 2
+    )
     f = np.fft.rfftfreq(n, 1 / rate)
-    edges = np.unique(np.round(np.geomspace(4, n // 2, 40)).astype(int))
-    bands = list(zip(edges[:-1], edges[1:], strict=True))
+    rates = power * f[:, None] ** 2
+    speed = rates.sum(axis=0)
+    # A joint that stands still shows its encoder's steps alone, and has nothing to say.
+    moves = rates[f < rate / 10].sum(axis=0) > speed / 2
+    chosen = moves if moves.any() else speed > 0
+    acceleration = f**4 * (power[:, chosen] / speed[chosen]).sum(axis=1)
+    # Twenty bands, a third of an octave or so: a single line of a spectrum says little.
+    edges = np.unique(np.round(np.geomspace(4, n // 2, 20)).astype(int))
+    bands = list(itertools.pairwise(edges))
     centre = np.array([f[low:high].mean() for low, high in bands])
-    # A joint that stands still has no speed to be relative to, and nothing to say.
-    speed = (power * f[:, None] ** 2).sum(axis=0)
-    share = (power / np.where(speed > 0, speed, np.inf)).sum(axis=1)
-    level = np.array([share[low:high].mean() for low, high in bands])
-    moving = int(np.argmax(level * centre**2))
-    acceleration = (level * centre**4)[moving:]
-    settled = int(np.argmax(acceleration <= 2 * acceleration.min()))
-    return float(min(centre[moving + settled], rate / 8))
+    level = np.array([acceleration[low:high].mean() for low, high in bands])
+    least = 5 * centre[int(np.argmax(level / centre**2))]
+    allowed = np.where(centre >= least, level, np.inf)
+    return float(min(max(least, centre[int(np.argmin(allowed))]), rate / 8))
 
 
 class Band(eqx.Module):

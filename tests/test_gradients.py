@@ -56,7 +56,7 @@ class Problem:
         batch = prepare(self.loop, Recordings.of(self.record))
         self.intervals = jax.tree.map(lambda leaf: leaf[0], batch.intervals)
         q = jnp.asarray(self.record.q[0])
-        self.x0 = initial(self.loop, q, 0.3 + 0.5 * jnp.abs(q))
+        self.x0 = initial(self.loop, self.intervals, q, 0.3 + 0.5 * jnp.abs(q))
         self.theta = self.loop.theta
         self.columns = len(self.theta) + len(self.x0)
 

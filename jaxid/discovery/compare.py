@@ -68,7 +68,7 @@ class Comparison(eqx.Module):
         return record.time[kept], measured, simulated
 
     @property
-    def residuals(self) -> tuple[Float[np.ndarray, "samples_ joints"], ...]:
+    def residuals(self) -> tuple[Float[np.ndarray, "_samples joints"], ...]:
         """Measured less simulated as they are compared, one `(samples, joints)` a recording."""
         found = [self.judged(k) for k in range(len(self.recordings))]
         return tuple(measured - simulated for _, measured, simulated in found)

@@ -30,6 +30,7 @@ from ..simulate import compared
 from .compare import Comparison, compare
 from .diagnose import Diagnosis, Verdict, diagnose, effect_parameters
 from .score import whitened
+from .signatures import amplitudes
 
 Outcome = Literal["adequate", "explained", "outside_catalogue"]
 
@@ -347,12 +348,14 @@ class _Search(eqx.Module):
             for v in diagnosis.ranking
             if v.possible and v.p_value < self.significance and v.evidence > 0
         ]
+        # A weak entry that no refit confirms is chance unless a curve finds something as well.
+        failing = "outside_catalogue" if diagnosis.depends_on() else done
         if not entries or len(steps) > most:
-            return "outside_catalogue", None
+            return failing, None
         contenders = self.refit(last, _with_forms(_leading(entries), diagnosis.forms), say)
         best = contenders[0] if contenders else None
         if best is None or best.criterion >= self.criterion(last.fit, diagnosis.noise):
-            return "outside_catalogue", None
+            return failing, None
         gained = self.criterion(last.fit, diagnosis.noise) - best.criterion
         if _curve_is_better(diagnosis, gained):
             return "outside_catalogue", None
@@ -373,11 +376,18 @@ class _Search(eqx.Module):
         found = []
         for verdict in leading:
             say(f"refit with {_name(*verdict.key)}")
-            loop = last.fit.loop.add(_inside(last.diagnosis.predicted(verdict)))
-            refitted = fit(loop, self.recordings, self.whitened_method(last.diagnosis))
-            value = self.criterion(refitted, last.diagnosis.noise)
-            if np.isfinite(value):
-                found.append(Contender(*verdict.key, refitted, value))
+            # What was screened at a finite setting may start in another valley at its prediction.
+            starts = [last.diagnosis.predicted(verdict)]
+            if not amplitudes(verdict.hypothesis.effect):
+                starts.append(verdict.hypothesis.effect)
+            tried = []
+            for effect in starts:
+                loop = last.fit.loop.add(_inside(effect))
+                refitted = fit(loop, self.recordings, self.whitened_method(last.diagnosis))
+                value = self.criterion(refitted, last.diagnosis.noise)
+                if np.isfinite(value):
+                    tried.append(Contender(*verdict.key, refitted, value))
+            found += sorted(tried, key=lambda c: c.criterion)[:1]
         return sorted(found, key=lambda c: c.criterion)
 
     def whitened_method(self, diagnosis: Diagnosis) -> SeparablePEM:
@@ -505,7 +515,7 @@ def _held_residuals(found: Fit, held_out: Recordings) -> list[Float[np.ndarray, 
 
 
 def _whitened_error(
-    residuals: Sequence[Float[np.ndarray, "samples_ joints"]], noise: Sequence[ARFilter]
+    residuals: Sequence[Float[np.ndarray, "_samples joints"]], noise: Sequence[ARFilter]
 ) -> float:
     """Squared error in units of the noise's innovations."""
     total = 0.0

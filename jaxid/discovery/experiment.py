@@ -76,8 +76,8 @@ class Experiment(eqx.Module):
     def __repr__(self) -> str:
         return (
             f"a reference of {self.recording.duration:.0f} s that sets "
-            f"{' and '.join(self.effects)} apart by {self.then:.3g} in whitened squared error; the recordings at hand do by "
-            f"{self.now:.3g} (ten is decisive)"
+            f"{' and '.join(self.effects)} apart by {self.then:.3g} in whitened squared error; "
+            f"the recordings at hand do by {self.now:.3g} (ten is decisive)"
         )
 
 

@@ -119,7 +119,9 @@ def respond(
     n = push.shape[2]
 
     def pairs(values):
-        return jnp.concatenate([values, jnp.concatenate([values[1:], values[-1:]])], axis=1)
+        # Beyond the last point the line goes on, so that its slope, a velocity, stays what it is.
+        beyond = 2 * values[-1:] - values[-2:-1]
+        return jnp.concatenate([values, jnp.concatenate([values[1:], beyond])], axis=1)
 
     def one(a, b, c, d, push, noise):
         first, second = slice(parameters, parameters + 2 * n), slice(parameters + 2 * n, None)

@@ -22,7 +22,7 @@ class Data(eqx.Module):
     """
 
     residual: Rows
-    base: Table
+    base: Float[np.ndarray, "recordings samples outputs absorbed"]
     table: Table
     mask: Bool[np.ndarray, "recordings samples"]
 
@@ -41,6 +41,10 @@ def whitened(
     for j, filt in enumerate(noise):
         level = np.sqrt(filt.variance) if filt.variance > 0 else 1.0
         out[:, :, j] = signal.lfilter(filt.polynomial / level, [1.0], x[:, :, j], axis=1)
+        # The filter does not know what came before the first sample; to call it zero would make
+        # outliers of the first rows, which anything that starts with a step then explains.
+        for row, there in zip(out[:, :, j], mask, strict=True):
+            row[: int(np.argmax(there)) + filt.order] = 0.0
     return out * mask.reshape(*mask.shape, *(1,) * (x.ndim - 2))
 
 
@@ -114,7 +118,8 @@ def gram_of(data: Data, noise: Sequence[ARFilter]) -> Gram:
     x -= basis @ (basis.T @ x)
     r = r - basis @ (basis.T @ r)
     outputs = data.residual.shape[2]
-    count = float(data.mask.sum() * outputs - basis.shape[1])
+    unknown = len(data.mask) * sum(f.order for f in noise)
+    count = float(data.mask.sum() * outputs - unknown - basis.shape[1])
     return Gram(products(x), x.T @ r, size, float(r @ r), count)
 
 

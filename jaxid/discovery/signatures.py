@@ -1,5 +1,6 @@
 """Signatures: what the closed loop would have shown, had an effect been there."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -150,7 +151,8 @@ def _settled_states(effect: AbstractEffect, motion: Motion) -> Float[Array, "poi
     def body(x, pair):
         now, then = pair
         h = then.t - now.t
-        middle = jax.tree.map(lambda a, b: 0.5 * (a + b), now, eqx.tree_at(_label, then, now.label))
+        middle = jax.tree.map(lambda a, b: 0.5 * (a + b), now, then)
+        middle = dataclasses.replace(middle, label=now.label)
 
         def rate(state):
             return effect.derivative(eqx.tree_at(lambda m: m.state, middle, state))
@@ -162,10 +164,6 @@ def _settled_states(effect: AbstractEffect, motion: Motion) -> Float[Array, "poi
 
     following = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), motion)
     return jax.lax.scan(body, start, (motion, following))[1]
-
-
-def _label(motion: Motion) -> Array:
-    return motion.label
 
 
 def _forces(
@@ -192,17 +190,28 @@ def _forces(
 
 
 @eqx.filter_jit
+def _left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings points joints"]:
+    """Torque that the loop's own effects leave for the links along the runs."""
+
+    def remaining(at: Motion):
+        states = tuple(effect.initial_state() for effect in loop.effects)
+        return at.tau - effect_load(loop, at, states)
+
+    return jax.vmap(jax.vmap(remaining))(motion)
+
+
+@eqx.filter_jit
 def _all_forces(
-    loop: ClosedLoop, groups: list[AbstractEffect], motion: Motion
+    groups: list[AbstractEffect],
+    motion: Motion,
+    left: Float[Array, "recordings points joints"],
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Forces of all hypotheses: one trace for each structure, `vmap` over its settings."""
+    """Forces of all hypotheses: one trace for each structure, `vmap` over its settings.
 
-    def of_run(run: Motion):
-        def remaining(at: Motion):
-            states = tuple(effect.initial_state() for effect in loop.effects)
-            return at.tau - effect_load(loop, at, states)
+    It does not know the loop, so that it is compiled once however the model grows.
+    """
 
-        left = jax.vmap(remaining)(run)
+    def of_run(run: Motion, left):
         pushes, noises = [], []
         for stacked in groups:
             push, noise = eqx.filter_vmap(
@@ -214,7 +223,7 @@ def _all_forces(
             noises.append(jnp.moveaxis(noise, 0, 2).reshape(shape))
         return jnp.concatenate(pushes, axis=-1), jnp.concatenate(noises, axis=-1)
 
-    return jax.vmap(of_run)(motion)
+    return jax.vmap(of_run)(motion, left)
 
 
 def _grouped(effects: Sequence[AbstractEffect]) -> list[tuple[AbstractEffect, list[int]]]:
@@ -230,18 +239,20 @@ def _grouped(effects: Sequence[AbstractEffect]) -> list[tuple[AbstractEffect, li
     ]
 
 
-def _difference(
-    loop: ClosedLoop, effect: AbstractEffect, batch: Batch, row: int
-) -> Float[Array, "recordings points joints"]:
-    return _finite(loop.add(effect), batch, row)
-
-
 @eqx.filter_jit
-def _finite(loop: ClosedLoop, batch: Batch, row: int) -> Float[Array, "recordings points joints"]:
-    def one(intervals, q0, v0):
-        return run(loop, intervals, initial(loop, intervals, q0, v0))[1][:, row]
+def _finite(
+    loop: ClosedLoop, stacked: AbstractEffect, batch: Batch, row: int
+) -> Float[Array, "recordings points joints settings"]:
+    """One signal of simulations with an effect, at all its settings."""
 
-    return jax.vmap(one)(batch.intervals, batch.q0, batch.v0)
+    def one(effect, intervals, q0, v0):
+        grown = loop.add(effect)
+        return run(grown, intervals, initial(grown, intervals, q0, v0))[1][:, row]
+
+    def setting(effect):
+        return jax.vmap(lambda i, q, v: one(effect, i, q, v))(batch.intervals, batch.q0, batch.v0)
+
+    return jnp.moveaxis(eqx.filter_vmap(setting, in_axes=eqx.if_array(0))(stacked), 0, -1)
 
 
 def signatures(
@@ -263,7 +274,8 @@ def signatures(
     groups = _grouped([proposed[k][0] for k in direct])
     if groups:
         say(f"{len(direct)} signatures by linear response")
-        push, noise = _all_forces(loop, [stacked for stacked, _ in groups], linear.motion)
+        left = _left_for_links(loop, linear.motion)
+        push, noise = _all_forces([stacked for stacked, _ in groups], linear.motion, left)
         wrong = noise if bool(jnp.any(noise != 0)) else None
         blocks.append(np.asarray(respond(linear, loop.theta.shape[0], push, wrong)))
         for _, places in groups:
@@ -272,14 +284,15 @@ def signatures(
                 width = max(1, sum(p.size for p in amplitudes(effect)))
                 made[direct[place]] = Hypothesis(effect, tuple(range(at, at + width)), tests)
                 at += width
-    for k, (effect, tests) in enumerate(proposed):
-        if k in made:
-            continue
-        say(f"{effect.effect_name()} by simulation")
-        moved = np.asarray(_difference(loop, effect, batch, row))
-        column = moved - np.asarray(linear.seen[:, :, row])
-        if np.isfinite(column).all():
-            blocks.append(column[..., None])
-            made[k] = Hypothesis(effect, (at,), tests)
-            at += 1
+    rest = [k for k in range(len(proposed)) if k not in made]
+    for stacked, places in _grouped([proposed[k][0] for k in rest]):
+        say(f"{stacked.effect_name()} by simulation")
+        moved = np.asarray(_finite(loop, stacked, batch, row))
+        columns = moved - np.asarray(linear.seen[:, :, row])[..., None]
+        for column, place in zip(np.moveaxis(columns, -1, 0), places, strict=True):
+            if np.isfinite(column).all():
+                blocks.append(column[..., None])
+                effect, tests = proposed[rest[place]]
+                made[rest[place]] = Hypothesis(effect, (at,), tests)
+                at += 1
     return [made[k] for k in sorted(made)], np.concatenate(blocks, axis=-1)

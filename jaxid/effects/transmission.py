@@ -57,8 +57,9 @@ class JointElasticity(AbstractTransmission):
 class Backlash(AbstractTransmission):
     """A gap in the transmission, with stiff contact on both sides.
 
-    `gap` is its whole width; `rotor` as for `JointElasticity`; contact stiffness and damping are
-    given, not estimated.
+    `gap` is its whole width; `rotor` as for `JointElasticity`. In contact the torque is
+    kc depth (1 + dk rate), the rate counted into the contact (Hunt, Crossley 1975), so that it does
+    not jump where contact begins; stiffness and damping are given, not estimated.
     """
 
     joint: int = eqx.field(static=True)
@@ -68,25 +69,20 @@ class Backlash(AbstractTransmission):
         100.0, symbol="kc", unit="N·m/rad", lower=0.0, scale=100.0, free=False, linear=False
     )
     damping: Scalar = parameter(
-        0.003, symbol="dk", unit="s", lower=0.0, scale=0.01, free=False, linear=False
+        3.0, symbol="dk", unit="s/rad", lower=0.0, scale=1.0, free=False, linear=False
     )
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Backlash"]:
-        """Gaps of a few thousandths of the travel; contact a quarter of the sample rate stiff."""
+        """Gaps up to three thousandths of the travel, contact at a quarter of the sample rate."""
         made = []
         for j in scene.joints:
             inertia = scene.inertia[j - 1]
             stiffness = 0.21 * inertia * (0.25 / scene.period * 2 * np.pi) ** 2
-            for share in (0.003, 0.008):
-                made.append(
-                    cls(
-                        joint=j,
-                        gap=share * scene.travel(j),
-                        rotor=0.3 * inertia,
-                        stiffness=stiffness,
-                    )
-                )
+            for share in (0.0003, 0.001, 0.003):
+                for part in (0.22, 0.32, 0.42):
+                    gap, rotor = share * scene.travel(j), part * inertia
+                    made.append(cls(joint=j, gap=gap, rotor=rotor, stiffness=stiffness))
         return made
 
     def scaled(self, factor: float) -> "Backlash":
@@ -100,5 +96,6 @@ class Backlash(AbstractTransmission):
     def through(self, twist: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
         """Torque passed on, N·m; nothing inside the gap."""
         depth = jnp.maximum(jnp.abs(twist) - self.gap / 2, 0.0)
-        damped = jnp.where(depth > 0, self.damping * rate, 0.0)
-        return -self.stiffness * (jnp.sign(twist) * depth + damped)
+        side = jnp.sign(twist)
+        grip = jnp.maximum(1 + self.damping * side * rate, 0.0)
+        return -side * self.stiffness * depth * grip

@@ -42,7 +42,7 @@ class Fit(eqx.Module):
     method: Any
     status: Status = eqx.field(static=True)
     covariance: Float[np.ndarray, "parameters parameters"]
-    residuals: tuple[Float[np.ndarray, "samples_ joints"], ...]
+    residuals: tuple[Float[np.ndarray, "_samples joints"], ...]
     error_percent: pd.DataFrame
     iterations: int = eqx.field(static=True, default=0)
     simulations: int = eqx.field(static=True, default=0)
@@ -148,8 +148,8 @@ def joint_columns(joints: int) -> list[str]:
 
 def relative_errors(
     recordings: Recordings | Sequence[Recording],
-    measured: Sequence[Float[np.ndarray, "samples_ joints"]],
-    residuals: Sequence[Float[np.ndarray, "samples_ joints"]],
+    measured: Sequence[Float[np.ndarray, "_samples joints"]],
+    residuals: Sequence[Float[np.ndarray, "_samples joints"]],
 ) -> pd.DataFrame:
     """100 · ‖residual‖ / ‖measured‖ by recording and joint (Table 3 of Brunot et al. 2016)."""
     rows = [

@@ -69,7 +69,10 @@ def sensitivity(
     if batch.band is not None:
         residual, slopes = batch.band(residual), batch.band(slopes)
     white = filtered_by(noise, jnp.concatenate([residual[..., None], slopes], axis=-1))
-    white = white * batch.kept[..., None, None]
+    # What came before the first sample is not known, so neither are the first filtered rows.
+    taps = noise.shape[1] - jnp.argmax((noise != 0)[:, ::-1], axis=1) - 1
+    row = jnp.cumsum(batch.kept, axis=1) - 1
+    white = white * (batch.kept[..., None] & (row[..., None] >= taps))[..., None]
     slopes = white[..., 1:]
     by_start = slopes[..., p:] if free_start else None
     return Sensitivity(residual, white[..., 0], slopes[..., :p], by_start)
@@ -116,7 +119,7 @@ class Point(eqx.Module):
     - `loss`: sum of squared weighted residuals; infinite where values are not physical or the
       simulation fails.
     - `gram`, `slope`: J'J and J'r for the parameters; `start_gram`, `start_slope` for the initial
-      states of each recording, and `cross` between the two.
+      states of each recording, and `cross` between the two; empty where none is estimated.
     """
 
     theta: Float[Array, " parameters"]
@@ -125,9 +128,9 @@ class Point(eqx.Module):
     loss: Float[Array, ""]
     gram: Float[Array, "parameters parameters"]
     slope: Float[Array, " parameters"]
-    start_gram: Float[Array, "recordings initials initials"]
-    start_slope: Float[Array, "recordings initials"]
-    cross: Float[Array, "recordings initials parameters"]
+    start_gram: Float[Array, "recordings estimated estimated"]
+    start_slope: Float[Array, "recordings estimated"]
+    cross: Float[Array, "recordings estimated parameters"]
 
 
 class Problem(eqx.Module):
@@ -195,7 +198,7 @@ class _Scales(eqx.Module):
     """Squared sizes of columns, the largest met so far (Moré 1978)."""
 
     theta: Float[np.ndarray, " parameters"]
-    start: Float[np.ndarray, "recordings initials"]
+    start: Float[np.ndarray, "recordings estimated"]
 
     @classmethod
     def of(cls, point: Point, before: "_Scales | None" = None) -> "_Scales":

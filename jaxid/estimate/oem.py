@@ -80,6 +80,9 @@ class OEM(AbstractMethod):
             raise FitError(
                 f"{loop.name} has no free parameter to estimate: free one with loop.free(name)"
             )
+        # What does not fit together is said before the work, not after it.
+        _signals(self, loop)
+        prepare(loop, pieces_of(recordings, self.window))
         with working(f"OEM of {loop.name}", self.progress) as say:
             loop = start_values(loop, recordings, self.start, say)
             loop = with_substeps(loop, recordings)
@@ -150,10 +153,14 @@ def pieces_of(recordings: Recordings, window: float | None) -> tuple[Recording, 
         return tuple(recordings)
     pieces = []
     for r in recordings:
-        step = max(2, round(window * r.rate))
+        step = round(window * r.rate)
+        if step < 8:
+            raise FitError(
+                f"a window of {window:g} s is only {step} samples of {r.name}: make it longer"
+            )
         for first in range(0, r.samples - 2, step):
             last = min(first + step, r.samples - 1)
-            if last - first >= min(step, 8):
+            if last - first >= 8:
                 end = r.time[last + 1] if last + 1 < r.samples else None
                 pieces.append(r.slice(float(r.time[first]), end if end is None else float(end)))
     if not pieces:
@@ -348,8 +355,8 @@ def _at_bounds(loop: ClosedLoop) -> list[str]:
 
 
 def score_covariance(
-    residuals: Sequence[Float[np.ndarray, "samples_ outputs"]],
-    jacobians: Sequence[Float[np.ndarray, "samples_ outputs parameters"]],
+    residuals: Sequence[Float[np.ndarray, "_samples outputs"]],
+    jacobians: Sequence[Float[np.ndarray, "_samples outputs parameters"]],
 ) -> Float[np.ndarray, "parameters parameters"]:
     """Covariance of J'r where residuals are coloured: their spectrum, weighed by J's.
 

@@ -213,7 +213,7 @@ def _evidence(diagnosis: Diagnosis) -> list[Content]:
             r["explained_percent"],
             _unbroken(r["amplitude"]),
             r["predicted_error_percent"],
-            "" if r["possible"] else "bounds forbid it",
+            "" if r["possible"] else "unphysical",
         ]
         for r in diagnosis.table().head(15).to_dict("records")
     ]

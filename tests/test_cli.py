@@ -1,0 +1,182 @@
+"""`jaxid fit`, `jaxid compare` and `jaxid demo`; `jaxid discover` has a file of its own."""
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import jaxid
+import jaxid.discovery
+from jaxid.cli import app, load_robot
+from jaxid.errors import ModelError
+
+DEMO = Path(jaxid.__file__).parent / "demo" / "clean"
+FIT_1, FIT_2, HELD_OUT = (str(DEMO / f"{name}.csv") for name in ("fit_1", "fit_2", "held_out"))
+
+OWN_ROBOT = """
+import jaxid
+
+loop = jaxid.scara().hold("MY2")
+
+
+def make():
+    return loop
+
+
+wrong = 3
+"""
+
+
+def run(*arguments):
+    """The command's result; an exception that it does not turn into a sentence is raised."""
+    return CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """A fit by the command: what it printed, and the file that it wrote."""
+    path = tmp_path_factory.mktemp("cli") / "fit.json"
+    return run("fit", FIT_1, FIT_2, "--json", path), path
+
+
+def test_fit_prints_a_table_and_writes_the_same_as_json(fitted):
+    result, path = fitted
+    assert result.exit_code == 0
+    assert "OEM() of scara to fit_1, fit_2: converged" in result.stdout
+    content = json.loads(path.read_text(encoding="utf-8"))
+    assert content["status"] == "converged"
+    assert content["parameters"]["ZZ1r"]["unit"] == "kg·m²"
+    shown = float(next(x for x in result.stdout.splitlines() if x.startswith("ZZ1r")).split()[1])
+    # Four digits are shown.
+    assert shown == pytest.approx(content["parameters"]["ZZ1r"]["value"], rel=5e-4)
+    # The demo's noise is 1.5 % of the torque.
+    assert all(1.4 < x < 1.6 for row in content["error_percent"].values() for x in row)
+
+
+def test_compare_takes_what_fit_wrote(fitted, tmp_path):
+    _, path = fitted
+    out, figure = tmp_path / "compare.json", tmp_path / "compare.html"
+    result = run("compare", HELD_OUT, "--fit", path, "--json", out, "--plot", figure)
+    assert result.exit_code == 0
+    errors = json.loads(out.read_text(encoding="utf-8"))["error_percent"]["held_out"]
+    assert all(1.4 < x < 1.7 for x in errors)
+    assert f"{errors[0]:.4g}" in result.stdout
+    assert "plotly" in figure.read_text(encoding="utf-8")
+    # The CAD start is far off, so the fitted values were used.
+    start = run("compare", HELD_OUT)
+    assert start.exit_code == 0
+    assert f"{errors[0]:.4g}" not in start.stdout
+
+
+@pytest.mark.parametrize("method", ["idim", "didim", "idim-iv"])
+def test_other_methods_by_name(method, tmp_path):
+    path = tmp_path / "fit.json"
+    assert run("fit", FIT_1, "--method", method, "--json", path).exit_code == 0
+    name = {"idim": "IDIM(", "didim": "DIDIM(", "idim-iv": "IDIMIV("}[method]
+    assert json.loads(path.read_text(encoding="utf-8"))["method"].startswith(name)
+
+
+def test_a_robot_of_ones_own(tmp_path):
+    file = tmp_path / "my_robot.py"
+    file.write_text(OWN_ROBOT)
+    for name in ("loop", "make"):
+        assert "MY2" in load_robot(f"{file}:{name}").held
+    result = run("fit", FIT_1, "--robot", f"{file}:loop", "--method", "idim")
+    assert result.exit_code == 0
+    assert "MX2" in result.stdout
+    assert "MY2" not in result.stdout
+
+
+def test_columns_and_units_by_name(tmp_path):
+    frame = pd.read_csv(FIT_1)
+    for name in ("q_1", "q_2", "q_ref_1", "q_ref_2"):
+        frame[name] *= 57.29577951308232
+    frame = frame.rename(columns={"q_1": "angle_a", "q_2": "angle_b"})
+    frame.to_csv(tmp_path / "degrees.csv", index=False)
+    one, other = tmp_path / "one.json", tmp_path / "other.json"
+    columns = ("--column", "time=time", "--column", "q=angle_a,angle_b")
+    columns += ("--column", "q_ref=q_ref_1,q_ref_2", "--column", "tau=tau_1,tau_2")
+    units = ("--unit", "q=deg", "--unit", "q_ref=deg")
+    here = run("fit", tmp_path / "degrees.csv", *columns, *units, "--method", "idim", "--json", one)
+    assert here.exit_code == 0, here.stderr
+    run("fit", FIT_1, "--method", "idim", "--json", other)
+    values = [json.loads(p.read_text(encoding="utf-8"))["parameters"] for p in (one, other)]
+    for name, entry in values[0].items():
+        assert entry["value"] == pytest.approx(values[1][name]["value"], rel=1e-6, abs=1e-9)
+
+
+def test_a_fit_that_failed_ends_with_one(monkeypatch, tmp_path):
+    file = tmp_path / "slow.py"
+    file.write_text("import jaxid\nloop = jaxid.scara().with_values(MX2=9.0)\n")
+    monkeypatch.setattr(
+        jaxid.estimate, "OEM", lambda window: jaxid.OEM(window=window, start="given")
+    )
+    result = run("fit", FIT_1, "--robot", f"{file}:loop", "--json", tmp_path / "fit.json")
+    assert result.exit_code == 1
+    assert "no parameter values were found" in result.stdout
+    assert json.loads((tmp_path / "fit.json").read_text())["status"] == "diverged"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["fit", "absent.csv"], "absent.csv"),
+        (["fit", FIT_1, "--robot", "delta"], "there is no robot 'delta': choose scara"),
+        (["fit", FIT_1, "--robot", "absent.py:loop"], "there is no file absent.py"),
+        (["fit", FIT_1, "--robot", "emps"], "choose another robot"),
+        (["fit", FIT_1, "--method", "guess"], "there is no method 'guess': choose oem"),
+        (["fit", FIT_1, "--controller", "fuzzy"], "there is no controller 'fuzzy'"),
+        (["fit", FIT_1, "--column", "q"], "has no '='"),
+        (["fit", FIT_1, "--unit", "q=parsec"], "is not a unit known for q"),
+        (["fit", FIT_1, "--window", "0.01"], "make it longer"),
+        (["compare", FIT_1, "--fit", FIT_1], "holds no fitted parameters"),
+    ],
+)
+def test_a_users_error_is_one_sentence(arguments, says, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert says in result.stderr
+    assert result.stderr.startswith("jaxid: ")
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_what_is_wrong_with_ones_own_robot_is_said(tmp_path):
+    file = tmp_path / "my_robot.py"
+    file.write_text(OWN_ROBOT)
+    for name in ("wrong", "absent"):
+        with pytest.raises(ModelError, match="has no ClosedLoop called"):
+            load_robot(f"{file}:{name}")
+    broken = tmp_path / "broken.py"
+    broken.write_text("import nothing_of_that_name\n")
+    with pytest.raises(ModelError, match="fails when it is imported"):
+        load_robot(f"{broken}:loop")
+
+
+def test_demo_tells_both_stories_on_files_that_are_shipped(monkeypatch):
+    class Story:
+        verdict = "adequate"
+
+        def __repr__(self):
+            return "adequate: a story\nof two lines"
+
+        def table(self):
+            return pd.DataFrame({"held out, joint 1": [4.0, 2.0]}, index=["start", "with it"])
+
+    asked = []
+
+    def discover(loop, used, validate):
+        asked.append((loop.name, used.names, validate.names, used[0].q[:3].tolist()))
+        return Story()
+
+    monkeypatch.setattr(jaxid.discovery, "discover", discover)
+    result = run("demo")
+    assert result.exit_code == 0
+    assert [a[:3] for a in asked] == [("scara", ("fit_1", "fit_2"), ("held_out",))] * 2
+    assert result.stdout.count("of two lines") == 2
+    # Each error as a bar, the start's twice as long as what is left.
+    bars = [line.count("█") for line in result.stdout.splitlines() if "█" in line]
+    assert bars == [30, 15, 30, 15]

@@ -1,0 +1,133 @@
+"""Comparisons: which signal is judged, over what, and what they show."""
+
+import dataclasses
+
+import independent as sim
+import numpy as np
+import pytest
+
+import jaxid
+from jaxid.control import OpenLoop, Tracking
+from jaxid.errors import FitError, RecordingError
+
+
+@pytest.fixture(scope="session")
+def case():
+    """A SCARA's case from the independent simulator."""
+    return sim.make_case(51, duration=8.0)
+
+
+@pytest.fixture(scope="session")
+def loop(case):
+    """The model with the true values."""
+    return jaxid.scara().with_values(**{n: getattr(case.plant, n) for n in case.plant.base})
+
+
+@pytest.fixture(scope="session")
+def recordings(case):
+    """Two of its recordings, of different lengths."""
+    rows = [(n, case.recordings[n]) for n in ("fit_1", "held_out")]
+    both = [
+        jaxid.Recording.from_arrays(r["time"], r["q"], r["tau"], q_ref=r["q_ref"], name=n)
+        for n, r in rows
+    ]
+    return jaxid.Recordings.of([both[0], both[1].slice(0.0, 6.0)])
+
+
+def test_at_the_truth_the_error_is_the_noise(case, loop, recordings):
+    found = jaxid.compare(loop, recordings)
+    floor = case.recordings["fit_1"]["noise_floor_percent"]
+    # The floor is what a perfect model leaves; the integration adds 1e-4 of the torque at most.
+    assert np.abs(found.error_percent.loc["fit_1"] / floor - 1).max() < 1e-2
+    assert found.signal == "torque"
+    assert list(found.error_percent.columns) == ["joint 1", "joint 2"]
+    assert [len(r) for r in found.residuals] == [801, 600]
+
+
+def test_errors_are_the_papers_relative_ones(loop, recordings):
+    found = jaxid.compare(loop.with_values(ZZ1r=4.5), recordings)
+    for recording, run in zip(recordings, found.runs, strict=True):
+        for signal, name in (("position", "q"), ("torque", "tau")):
+            measured, simulated = getattr(recording, name), np.asarray(getattr(run, name))
+            size = np.linalg.norm(measured, axis=0)
+            expected = 100 * np.linalg.norm(measured - simulated, axis=0) / size
+            assert np.allclose(found.errors.loc[(recording.name, signal)], expected)
+    assert set(found.errors.index.unique("signal")) == {"position", "velocity", "torque"}
+
+
+def test_a_measured_velocity_is_what_velocity_is_held_against(case, loop, recordings):
+    r = case.recordings["fit_1"]
+    with_v = dataclasses.replace(recordings[0], v=r["v_true"])
+    derived, measured = (
+        jaxid.compare(loop, x).errors.loc[("fit_1", "velocity")] for x in (recordings[0], with_v)
+    )
+    assert np.all(measured < 0.1 * derived)
+
+
+def test_open_loop_is_judged_by_position_in_windows(loop, recordings):
+    driven = dataclasses.replace(loop, controller=OpenLoop())
+    short, long = (jaxid.compare(driven, recordings, window=w) for w in (0.4, 4.0))
+    assert short.signal == "position"
+    assert "torque" not in short.errors.index.unique("signal")
+    assert [len(r) for r in short.residuals] == [801, 600]
+    # Noise in the torque is integrated: an arm that is not held loses its way with time.
+    assert np.all(short.error_percent.to_numpy() < long.error_percent.to_numpy())
+
+
+def test_a_fit_brings_its_window(loop, recordings):
+    driven = dataclasses.replace(loop, controller=OpenLoop())
+    fit = jaxid.fit(driven, recordings, jaxid.OEM(window=1.0, start="given"))
+    own, given = jaxid.compare(fit, recordings), jaxid.compare(fit.loop, recordings, window=1.0)
+    assert own.errors.equals(given.errors)
+
+
+def test_tracking_compares_torques_that_passed_the_same_low_pass(loop, recordings):
+    tracking = dataclasses.replace(loop, controller=Tracking(cutoff=5.0))
+    found = jaxid.compare(tracking, recordings)
+    time, measured, simulated = found.judged(0)
+    # Two periods of the cutoff are lost at each end.
+    assert time[0] == pytest.approx(0.4, abs=0.011)
+    assert time[-1] == pytest.approx(recordings[0].time[-1] - 0.4, abs=0.011)
+    assert measured.shape == simulated.shape == (len(time), 2)
+    rows = np.linalg.norm(measured - simulated, axis=0) / np.linalg.norm(measured, axis=0)
+    assert np.allclose(100 * rows, found.error_percent.loc["fit_1"])
+    # Above twice the cutoff the filter leaves 1 / (1 + 2^8) squared of the noise's power.
+    spectrum = np.abs(np.fft.rfft(measured * np.hanning(len(time))[:, None], axis=0)) ** 2
+    f = np.fft.rfftfreq(len(time), 0.01)
+    assert np.all(spectrum[f > 10].sum(axis=0) < 1e-6 * spectrum.sum(axis=0))
+    assert np.array_equal(found.residuals[0], measured - simulated)
+
+
+def test_what_a_comparison_shows(loop, recordings):
+    found = jaxid.compare(loop, recordings)
+    assert "relative error in %" in repr(found)
+    assert "held_out" in repr(found)
+    assert "<table" in found._repr_html_()
+    content = found.to_dict()
+    assert content["error_percent"]["fit_1"] == found.error_percent.loc["fit_1"].tolist()
+    assert set(content["errors"]) == {"position", "velocity", "torque"}
+    by_name, by_number = found.plot("held_out"), found.plot(1)
+    assert by_name == by_number
+    assert {trace.name for trace in by_name.data} >= {"measured", "simulated", "residual"}
+    assert len(found.plot_errors().data) > 0
+    acf, bound = found.autocorrelation("fit_1", lags=20)
+    assert acf.shape == (21, 2)
+    assert np.allclose(acf[0], 1.0)
+    assert bound == pytest.approx(2 / np.sqrt(801))
+
+
+def test_a_recording_that_is_not_there_is_refused(loop, recordings):
+    with pytest.raises(RecordingError, match="fit_1, held_out"):
+        jaxid.compare(loop, recordings).plot("fit_9")
+
+
+def test_a_loop_that_diverges_is_said(recordings):
+    # Velocity fed back with the wrong sign, and strongly.
+    law = jaxid.control.PD(Kp=[6.25, 156.25], Kv=[-2e3, -2e3], Kg=[3.5, 0.06])
+    with pytest.raises(FitError, match="diverges when it is simulated along fit_1"):
+        jaxid.compare(jaxid.scara(law), recordings)
+
+
+def test_another_robots_recording_is_refused(loop, recordings):
+    with pytest.raises(RecordingError, match="joint"):
+        jaxid.compare(jaxid.emps(), recordings)
