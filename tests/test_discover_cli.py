@@ -14,6 +14,10 @@ import jaxid
 import jaxid.discovery
 from jaxid.cli import app, spread
 
+# What one worker has fitted serves all of them.
+pytestmark = pytest.mark.xdist_group("demo")
+
+
 DEMO = Path(jaxid.__file__).parent / "demo"
 HIDDEN = [str(DEMO / "hidden" / f"{name}.csv") for name in ("fit_1", "fit_2", "held_out")]
 

@@ -55,6 +55,7 @@ def bump_story(bump_case) -> jaxid.Discovery:
     return jaxid.discover(jaxid.scara(), fit, held_out, progress=False)
 
 
+@pytest.mark.xdist_group("bump")
 def test_strange_effect_is_said_to_be_outside(bump_story):
     assert bump_story.verdict == "outside_catalogue"
     first = bump_story.to_dict()["depends_on"][0]
@@ -62,6 +63,7 @@ def test_strange_effect_is_said_to_be_outside(bump_story):
     assert "joint 2" in bump_story.sentence
 
 
+@pytest.mark.xdist_group("bump")
 def test_curve_shows_the_bump_where_it_is(bump_case, bump_story):
     curve = bump_story.suggestion()
     grid = np.linspace(float(curve.low), float(curve.high), 400)
@@ -74,6 +76,7 @@ def test_curve_shows_the_bump_where_it_is(bump_case, bump_story):
     assert abs(peak - truth.angle) < spacing
 
 
+@pytest.mark.xdist_group("bump")
 def test_own_effect_reaches_the_noise_floor(bump_case, bump_story):
     fit, held_out = recordings_of(bump_case)
     curve = bump_story.suggestion()
@@ -87,6 +90,7 @@ def test_own_effect_reaches_the_noise_floor(bump_case, bump_story):
     assert np.all(after <= 1.03 * floor_of(bump_case))
 
 
+@pytest.mark.xdist_group("bump")
 def test_curve_can_be_added_like_any_effect(bump_case, bump_story):
     fit, held_out = recordings_of(bump_case)
     loop = bump_story.steps[0].fit.loop.add(bump_story.suggestion())
@@ -97,6 +101,7 @@ def test_curve_can_be_added_like_any_effect(bump_case, bump_story):
     assert after - floor < 0.3 * (before - floor)
 
 
+@pytest.mark.xdist_group("bump")
 def test_own_effect_is_screened_like_the_rest(bump_story):
     class AtHalf(Bump):
         @classmethod
@@ -115,6 +120,7 @@ def test_own_effect_is_screened_like_the_rest(bump_story):
     assert diagnosis.best.place == best.hypothesis.effect.place
 
 
+@pytest.mark.xdist_group("bump")
 def test_results_show_themselves(bump_story):
     diagnosis = bump_story.steps[0].diagnosis
     assert {"effect", "joint", "p_value", "amplitude"} <= set(diagnosis.table().columns)
@@ -125,7 +131,7 @@ def test_results_show_themselves(bump_story):
         diagnosis.plot_shares(joint=2),
         bump_story.plot(),
     ):
-        assert figure.layout.xaxis.title.text
+        assert any(axis.title.text for axis in figure.select_xaxes())
     assert "q2" in bump_story._repr_html_()
 
 
@@ -144,6 +150,7 @@ def offset_story(offset_case, tmp_path_factory):
     return story, journal
 
 
+@pytest.mark.xdist_group("offset")
 def test_missing_effect_is_found_added_and_leaves_the_floor(offset_case, offset_story):
     story, _ = offset_story
     told = story.to_dict()
@@ -157,6 +164,7 @@ def test_missing_effect_is_found_added_and_leaves_the_floor(offset_case, offset_
     assert before[1] > after[1]
 
 
+@pytest.mark.xdist_group("offset")
 def test_interrupted_discovery_goes_on(offset_case, offset_story):
     story, journal = offset_story
     fit, held_out = recordings_of(offset_case)
@@ -165,6 +173,7 @@ def test_interrupted_discovery_goes_on(offset_case, offset_story):
     np.testing.assert_allclose(again.fit.theta, story.fit.theta, rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.xdist_group("offset")
 def test_journal_of_other_recordings_is_refused(offset_story):
     _, journal = offset_story
     fit, _ = recordings_of(sim.make_case(8, effects=[], noise="white", duration=4.0))
@@ -178,6 +187,7 @@ def test_journal_of_other_recordings_is_refused(offset_story):
         jaxid.discover(jaxid.scara(), renamed, resume=journal, progress=False)
 
 
+@pytest.mark.xdist_group("offset")
 def test_next_experiment_keeps_its_limits_and_separates(offset_story):
     story, _ = offset_story
     diagnosis = story.steps[0].diagnosis
@@ -212,12 +222,14 @@ def test_effective_tests_are_honest():
     assert corrected(0.01, 10) == pytest.approx(1 - 0.99**10)
 
 
+@pytest.mark.xdist_group("offset")
 def test_unknown_catalogue_entry_is_refused(offset_story):
     story, _ = offset_story
     with pytest.raises(jaxid.errors.ModelError, match="cannot be screened"):
         jaxid.diagnose(story.steps[0].fit, catalogue=("stribeck",), progress=False)
 
 
+@pytest.mark.xdist_group("offset")
 def test_effect_given_as_an_object_is_screened(offset_story):
     story, _ = offset_story
     diagnosis = jaxid.diagnose(

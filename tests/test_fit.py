@@ -14,6 +14,10 @@ from jaxid.effects import TorqueOffset
 from jaxid.errors import FitError, RecordingError
 from jaxid.estimate import _least_squares as ls
 
+# What one worker has fitted serves all of them.
+pytestmark = pytest.mark.xdist_group("fit")
+
+
 SEEDS = (41, 42)
 
 

@@ -34,7 +34,7 @@ def test_emps_output_error_beats_the_published_figures(shared_file):
     pulses = jaxid.read(shared_file("emps/DATA_EMPS_PULSES.mat"))
     fit = jaxid.fit(jaxid.emps(), fitted)
     assert fit.status is jaxid.Status.converged
-    # Simulation with the published values leaves 4.4 % and 5.2 %, and least squares may not be worse.
+    # Simulation with the published values leaves 4.4 % and 5.2 %: a fit may not be worse.
     assert fit.error_percent.iloc[0, 0] < 4.4
     assert jaxid.compare(fit, pulses).error_percent.iloc[0, 0] < 5.2
     values = dict(zip(fit.names, fit.theta, strict=True))

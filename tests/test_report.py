@@ -13,6 +13,10 @@ from jaxid.errors import ModelError
 from jaxid.report import write
 from jaxid.report._html import Markup, join, number, probability, table, tag
 
+# What one worker has fitted serves all of them.
+pytestmark = pytest.mark.xdist_group("demo")
+
+
 HOSTILE = "<script>alert(1)</script>"
 IMAGE = '"><img src=x onerror=alert(1)>'
 

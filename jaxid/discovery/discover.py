@@ -585,9 +585,8 @@ class _Journal(eqx.Module):
 
     def replay(self, search: _Search, loop: ClosedLoop, say: Callable[[str], None]) -> list[Step]:
         """The steps that the file holds, fitted again from their own values; or the first."""
-        steps = [search.begin(loop, say)]
         if self.path is None or not self.path.exists():
-            return steps
+            return [search.begin(loop, say)]
         try:
             content = json.loads(self.path.read_text(encoding="utf-8"))
             same = content["recordings"] == list(self.recordings.names)
@@ -601,6 +600,7 @@ class _Journal(eqx.Module):
                 f"{self.path} belongs to other recordings ({', '.join(content['recordings'])}): "
                 "give another file, or delete it to start anew"
             )
+        steps = [search.begin(loop, say)]
         classes = {c.__name__: c for c in search.catalogue if isinstance(c, type)}
         for entry in entries:
             if entry["effect"] not in classes:

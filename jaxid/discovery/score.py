@@ -142,7 +142,8 @@ def noise_of(data: Data, leftover: Rows, lost: float) -> tuple[ARFilter, ...]:
     share = 1 / (1 - min(lost / outputs / total, 0.5))
     filters = []
     for j in range(outputs):
-        found = fit_ar([s - s.mean() for s in data.series(leftover, j)], highest=30)
+        series = [s - s.mean() for s in data.series(leftover, j)]
+        found = fit_ar(series, highest=30, criterion="bic")
         filters.append(ARFilter(found.coefficients, max(found.variance * share, 1e-300)))
     return tuple(filters)
 
@@ -196,11 +197,12 @@ def select(gram: Gram, blocks: Sequence[Sequence[int]], most: int, margin: float
 def estimate_noise(
     data: Data, blocks: Sequence[Sequence[int]]
 ) -> tuple[tuple[ARFilter, ...], list[int]]:
-    """The noise filter with everything in the model that could be physics (not of a spring's pull).
+    """The noise filter with everything in the model that could be physics.
 
-    A rich model (base and all signatures, slightly ridged) leaves the first estimate; it takes a
-    share of the noise with it. With that filter the few signatures that matter are picked, and
-    the filter is estimated again with those alone in the model.
+    Two starts: what the base leaves, whose filter may take a spring's slow pull for noise, and what
+    a rich model leaves (base and all signatures, slightly ridged), which takes a share of the noise
+    with it. From each, the few signatures that matter are picked and the filter is estimated again
+    with those alone in the model; the likelier of the two ends, by BIC, is believed.
 
     **Returns:** the filters, and the blocks that were picked.
     """
@@ -209,17 +211,30 @@ def estimate_noise(
         for j in range(data.residual.shape[2])
     )
     every = range(data.table.shape[-1])
-    noise = noise_of(data, leftover(data, flat, every, 1e-4), 0.0)
+    starts = [leftover(data, flat, (), 1e-9), leftover(data, flat, every, 1e-4)]
+    ends = [_settle(data, blocks, noise_of(data, start, 0.0)) for start in starts]
+    _, noise, chosen = min(ends, key=lambda end: end[0])
+    return noise, chosen
+
+
+def _settle(
+    data: Data, blocks: Sequence[Sequence[int]], noise: tuple[ARFilter, ...]
+) -> tuple[float, tuple[ARFilter, ...], list[int]]:
+    """Picks signatures and estimates the filter in turn; BIC, filters and blocks at the end."""
     chosen: list[int] = []
-    for _ in range(3):
+    columns: list[int] = []
+    for _ in range(2):
         before = chosen
         chosen = select(gram_of(data, noise), blocks, 12, 10.0)
         columns = [c for k in chosen for c in blocks[k]]
         rest = leftover(data, noise, columns, 1e-9)
         noise = noise_of(data, rest, data.base.shape[-1] + len(columns))
-        if chosen == before or not chosen:
+        if chosen == before:
             break
-    return noise, chosen
+    count = float(data.mask.sum())
+    spread = sum(count * np.log(f.variance) for f in noise)
+    free = len(columns) + sum(f.order for f in noise)
+    return float(spread + free * np.log(count * len(noise))), noise, chosen
 
 
 # --- p-values that count how many were asked ---------------------------------------------------
