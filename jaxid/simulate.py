@@ -432,7 +432,7 @@ def simulate(
 def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     """The loop with the number of steps between samples settled, where the user left it open.
 
-    A step is at most 2.5 ms, and at most a third of the fastest time constant, met
+    A step is at most 2.5 ms, and at most a quarter of the fastest time constant, met
     with friction at its steepest, at standstill.
     """
     check_joints(loop, recordings[0])
@@ -444,7 +444,7 @@ def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     rate = fastest_rate(loop, recordings)
     # The torque of a stiff made-up law is wrong by about (pace · step)⁴ / 20.
     pace = 7 * loop.controller.pace
-    substeps = int(np.ceil(interval * max(1 / 2.5e-3, rate / 1.5, pace) - 1e-9))
+    substeps = int(np.ceil(interval * max(1 / 2.5e-3, rate / 0.25, pace) - 1e-9))
     return set_substeps(loop, int(np.clip(substeps, 1, 64)))
 
 
