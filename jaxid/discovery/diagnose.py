@@ -32,10 +32,8 @@ from .score import (
     chance,
     corrected,
     effective_tests,
-    estimate_noise,
-    gram_of,
-    leftover,
 )
+from .separate import columns_of, estimate_noise, leftover
 from .signatures import Hypothesis, amplitudes, candidates, curves, signatures, survey
 
 
@@ -115,7 +113,7 @@ class Diagnosis(eqx.Module):
 
     def predicted_error(self, verdict: Verdict) -> Float[np.ndarray, " joints"]:
         """Relative error over all fitted recordings that adding the effect would leave, %."""
-        rest = leftover(self.data, self.noise, verdict.hypothesis.columns, 1e-9)
+        rest = leftover(self.data, self.noise, verdict.hypothesis.columns)
         return 100 * np.sqrt(np.sum(rest**2, axis=(0, 1))) / self._measured()
 
     def _measured(self) -> Float[np.ndarray, " joints"]:
@@ -385,8 +383,8 @@ def _at_samples(batch: Batch, x: Float[np.ndarray, "recordings points *axes"]) -
     if batch.at is not None:
         x = np.stack([row[at] for row, at in zip(x, np.asarray(batch.at), strict=True)])
     mask = np.asarray(batch.mask).reshape(*batch.mask.shape, *(1,) * (x.ndim - 2))
-    x = x * mask
-    return x if batch.band is None else np.asarray(batch.band(jnp.asarray(x)))
+    x = x * mask.astype(x.dtype)
+    return x if batch.band is None else np.asarray(batch.band(jnp.asarray(x)), x.dtype)
 
 
 def _residual_and_base(
@@ -449,20 +447,20 @@ def _judge(
 ) -> Diagnosis:
     blocks = [h.columns for h in hypotheses]
     noise, picked = estimate_noise(data, blocks)
-    gram = gram_of(data, noise)
+    gram = Gram.of(data, noise)
     tests = effective_tests(gram, blocks)
     ranking: dict[tuple[Any, ...], Verdict] = {}
     forms: dict[tuple[Any, ...], Verdict] = {}
     where: dict[tuple[Any, ...], Verdict] = {}
-    for hypothesis in hypotheses:
-        verdict = _verdict(gram, hypothesis, tests)
+    for hypothesis, explained, freedom in zip(hypotheses, *gram.explained(blocks), strict=True):
+        verdict = _verdict(gram, hypothesis, float(explained), int(freedom), tests)
         effect = hypothesis.effect
         if isinstance(effect, Curve):
             where[(effect.label, effect.joint, effect.signed)] = verdict
             continue
         _keep_better(ranking, verdict.key, verdict)
         _keep_better(forms, (*verdict.key, type(effect)), verdict)
-    columns = [c for k in picked for c in blocks[k]]
+    columns = columns_of(blocks, picked)
     return Diagnosis(
         fit,
         tuple(sorted(ranking.values(), key=_order, reverse=True)),
@@ -473,7 +471,7 @@ def _judge(
         gram,
         scene,
         motion,
-        _floor(fit, data, leftover(data, noise, columns, 1e-9), len(columns)),
+        _floor(fit, data, leftover(data, noise, columns), len(columns)),
         tests,
         significance,
     )
@@ -490,8 +488,9 @@ def _order(verdict: Verdict) -> float:
     return verdict.evidence
 
 
-def _verdict(gram: Gram, hypothesis: Hypothesis, tests: float) -> Verdict:
-    explained, freedom = gram.explained(hypothesis.columns)
+def _verdict(
+    gram: Gram, hypothesis: Hypothesis, explained: float, freedom: int, tests: float
+) -> Verdict:
     p = corrected(min(1.0, chance(explained, freedom) * hypothesis.tests), tests)
     price = freedom * np.log(gram.count) + 2 * np.log(hypothesis.tests)
     possible = freedom > 0 and _within_bounds(gram, hypothesis)
@@ -500,13 +499,11 @@ def _verdict(gram: Gram, hypothesis: Hypothesis, tests: float) -> Verdict:
 
 def _within_bounds(gram: Gram, hypothesis: Hypothesis) -> bool:
     """Whether the predicted amplitudes are physical (a drag that pushes is not)."""
-    linear = amplitudes(hypothesis.effect)
     values, _ = gram.amplitude(hypothesis.columns)
-    if not linear:
-        return bool(values[0] > 0)
-    lower = np.concatenate([np.full(p.size, p.declaration.lower) for p in linear])
-    upper = np.concatenate([np.full(p.size, p.declaration.upper) for p in linear])
-    return bool(np.all((values > lower) & (values < upper)))
+    return all(
+        low < value < high
+        for value, low, high in zip(values, hypothesis.lower, hypothesis.upper, strict=True)
+    )
 
 
 def _floor(

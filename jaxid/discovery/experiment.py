@@ -15,7 +15,7 @@ from ..recording import Recording
 from ..simulate import prepare, with_substeps
 from .diagnose import Diagnosis, Verdict, _at_samples
 from .linear import base_columns, linearise
-from .score import Data, Gram, gram_of
+from .score import Data, Gram
 from .signatures import signatures
 
 
@@ -188,7 +188,7 @@ def _separations(
         data = Data(
             np.zeros_like(tau)[None], base[k : k + 1], rows[k : k + 1], np.ones((1, len(tau)), bool)
         )
-        scores[k] = _apart(gram_of(data, diagnosis.noise), columns, sizes)
+        scores[k] = _apart(Gram.of(data, diagnosis.noise), columns, sizes)
     return scores, runs
 
 

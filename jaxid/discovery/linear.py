@@ -1,6 +1,7 @@
 """The loop along a run as a linear time-varying system: linearise once, force many."""
 
 import dataclasses
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -104,39 +105,37 @@ def base_columns(
 @eqx.filter_jit
 def respond(
     linear: Linearised,
-    parameters: int,
-    push: Float[Array, "recordings points joints columns"],
-    noise: Float[Array, "recordings points joints columns"] | None = None,
+    place: Literal["push", "noise"],
+    values: Float[Array, "recordings points joints columns"],
 ) -> Float[Array, "recordings points outputs columns"]:
-    """What torque on the joints, and errors of the sensors, do to the output through the loop.
+    """What inputs given at the points do to the output through the loop; linear in between.
 
     **Arguments:**
 
-    - `parameters`: how many inputs of `linear` are parameters.
-    - `push`: torque on the joints, one column a hypothesis, N·m or N.
-    - `noise`: what is added to the sensors' positions, rad or m.
+    - `place`: `"push"` for torque on the joints, `"noise"` for what is added to the sensors.
+    - `values`: one column a hypothesis, N·m or N, rad or m.
     """
-    n = push.shape[2]
 
-    def pairs(values):
+    joints, last = values.shape[2], linear.B.shape[-1]
+    first = last - {"push": 4, "noise": 2}[place] * joints
+    inputs = slice(first, first + 2 * joints)
+
+    def times(matrix, columns):
+        # Written out, the four products fuse into one loop over the columns.
+        return jnp.sum(matrix[:, :, None] * columns[None], axis=1)
+
+    def one(a, b, c, d, values):
+        def body(carry, step):
+            s, now = carry
+            a, b, c, d, then = step
+            u = jnp.concatenate([now, then])
+            return (times(a, s) + times(b, u), then), times(c, s) + times(d, u)
+
         # Beyond the last point the line goes on, so that its slope, a velocity, stays what it is.
         beyond = 2 * values[-1:] - values[-2:-1]
-        return jnp.concatenate([values, jnp.concatenate([values[1:], beyond])], axis=1)
+        after = jnp.concatenate([values[1:], beyond])
+        zero = jnp.zeros((a.shape[-1], values.shape[-1]), values.dtype)
+        matrices = (x.astype(values.dtype) for x in (a, b[..., inputs], c, d[..., inputs]))
+        return jax.lax.scan(body, (zero, values[0]), (*matrices, after))[1]
 
-    def one(a, b, c, d, push, noise):
-        first, second = slice(parameters, parameters + 2 * n), slice(parameters + 2 * n, None)
-        inputs, b_in, d_in = pairs(push), b[..., first], d[..., first]
-        forced, direct = b_in @ inputs, d_in @ inputs
-        if noise is not None:
-            wrong = pairs(noise)
-            forced, direct = forced + b[..., second] @ wrong, direct + d[..., second] @ wrong
-
-        def body(s, step):
-            a, f = step
-            return a @ s + f, s
-
-        zero = jnp.zeros((a.shape[-1], push.shape[-1]))
-        _, history = jax.lax.scan(body, zero, (a, forced))
-        return c @ history + direct
-
-    return jax.vmap(one)(linear.A, linear.B, linear.C, linear.D, push, noise)
+    return jax.vmap(one)(linear.A, linear.B, linear.C, linear.D, values)

@@ -23,11 +23,14 @@ from .linear import Linearised, respond
 class Hypothesis(eqx.Module):
     """One effect at one setting, with its columns in the table of signatures.
 
-    `tests` counts how many settings it stands for, where it was picked from many by the data.
+    `lower` and `upper` bound the amplitudes; `tests` counts how many settings it stands for, where
+    it was picked from many by the data.
     """
 
     effect: AbstractEffect
     columns: tuple[int, ...] = eqx.field(static=True)
+    lower: tuple[float, ...] = eqx.field(static=True)
+    upper: tuple[float, ...] = eqx.field(static=True)
     tests: float = eqx.field(static=True, default=1.0)
 
     @property
@@ -221,7 +224,8 @@ def _all_forces(
             shape = (*push.shape[1:3], -1)
             pushes.append(jnp.moveaxis(push, 0, 2).reshape(shape))
             noises.append(jnp.moveaxis(noise, 0, 2).reshape(shape))
-        return jnp.concatenate(pushes, axis=-1), jnp.concatenate(noises, axis=-1)
+        push, noise = jnp.concatenate(pushes, axis=-1), jnp.concatenate(noises, axis=-1)
+        return push.astype(jnp.float32), noise.astype(jnp.float32)
 
     return jax.vmap(of_run)(motion, left)
 
@@ -276,23 +280,37 @@ def signatures(
         say(f"{len(direct)} signatures by linear response")
         left = _left_for_links(loop, linear.motion)
         push, noise = _all_forces([stacked for stacked, _ in groups], linear.motion, left)
-        wrong = noise if bool(jnp.any(noise != 0)) else None
-        blocks.append(np.asarray(respond(linear, loop.theta.shape[0], push, wrong)))
+        table = np.array(respond(linear, "push", push))
+        reading = np.flatnonzero(np.asarray(jnp.any(noise != 0, axis=(0, 1, 2))))
+        if len(reading):
+            table[..., reading] += respond(linear, "noise", noise[..., reading])
+        blocks.append(table)
         for _, places in groups:
+            low, high = _amplitude_bounds(proposed[direct[places[0]]][0])
             for place in places:
                 effect, tests = proposed[direct[place]]
-                width = max(1, sum(p.size for p in amplitudes(effect)))
-                made[direct[place]] = Hypothesis(effect, tuple(range(at, at + width)), tests)
-                at += width
+                columns = tuple(range(at, at + len(low)))
+                made[direct[place]] = Hypothesis(effect, columns, low, high, tests)
+                at += len(low)
     rest = [k for k in range(len(proposed)) if k not in made]
     for stacked, places in _grouped([proposed[k][0] for k in rest]):
         say(f"{stacked.effect_name()} by simulation")
         moved = np.asarray(_finite(loop, stacked, batch, row))
-        columns = moved - np.asarray(linear.seen[:, :, row])[..., None]
+        columns = (moved - np.asarray(linear.seen[:, :, row])[..., None]).astype(np.float32)
+        low, high = _amplitude_bounds(proposed[rest[places[0]]][0])
         for column, place in zip(np.moveaxis(columns, -1, 0), places, strict=True):
             if np.isfinite(column).all():
                 blocks.append(column[..., None])
                 effect, tests = proposed[rest[place]]
-                made[rest[place]] = Hypothesis(effect, (at,), tests)
+                made[rest[place]] = Hypothesis(effect, (at,), low, high, tests)
                 at += 1
     return [made[k] for k in sorted(made)], np.concatenate(blocks, axis=-1)
+
+
+def _amplitude_bounds(effect: AbstractEffect) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Bounds of every amplitude; of a finite setting, how much of it there is: more than none."""
+    linear = amplitudes(effect)
+    if not linear:
+        return (0.0,), (np.inf,)
+    low = tuple(p.declaration.lower for p in linear for _ in range(p.size))
+    return low, tuple(p.declaration.upper for p in linear for _ in range(p.size))

@@ -1,0 +1,146 @@
+"""Noise told apart from physics: filters estimated with all that could be an effect in the model."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ..noise import ARFilter, fit_ar
+from .score import WEAK, Blocks, Data, Rows, Whitened, by_width, explained_by, whitened
+
+
+def estimate_noise(data: Data, blocks: Blocks) -> tuple[tuple[ARFilter, ...], list[int]]:
+    """The noise filters, one an output, and the blocks that were picked to leave noise alone.
+
+    Two starts: what the base leaves, whose filter may take a spring's slow pull for noise, and what
+    the base and the blocks that matter most to plain least squares leave, which have taken a share
+    of slow noise with them. From each, blocks are picked through the filter and the filter is
+    estimated again with those in the model; the likelier of the two ends, by BIC, is believed.
+    """
+    flat = tuple(
+        ARFilter(np.zeros(0), float(np.mean(np.concatenate(data.series(data.residual, j)) ** 2)))
+        for j in range(data.residual.shape[2])
+    )
+    plain = leftover(data, flat, ())
+    level = noise_of(data, plain, data.base.shape[-1], highest=0)
+    rich = columns_of(blocks, select(Whitened.of(data, level), blocks))
+    ends = [_settle(data, blocks, noise_of(data, plain, 0.0))]
+    if rich:
+        start = leftover(data, level, rich)
+        ends.append(_settle(data, blocks, noise_of(data, start, len(rich))))
+    _, noise, chosen = min(ends, key=lambda end: end[0])
+    return noise, chosen
+
+
+def _settle(
+    data: Data, blocks: Blocks, noise: tuple[ARFilter, ...]
+) -> tuple[float, tuple[ARFilter, ...], list[int]]:
+    """Picks signatures and estimates the filter in turn; BIC, filters and blocks at the end."""
+    chosen: list[int] = []
+    columns: list[int] = []
+    for _ in range(2):
+        before = chosen
+        chosen = select(Whitened.of(data, noise), blocks)
+        columns = columns_of(blocks, chosen)
+        rest = leftover(data, noise, columns)
+        noise = noise_of(data, rest, data.base.shape[-1] + len(columns))
+        if chosen == before:
+            break
+    count = float(data.mask.sum())
+    spread = sum(count * np.log(f.variance) for f in noise)
+    free = len(columns) + sum(f.order for f in noise)
+    return float(spread + free * np.log(count * len(noise))), noise, chosen
+
+
+def columns_of(blocks: Blocks, chosen: Sequence[int]) -> list[int]:
+    """Columns of the chosen blocks."""
+    return [c for k in chosen for c in blocks[k]]
+
+
+def noise_of(
+    data: Data, rows: Rows, lost: float, highest: int = 30
+) -> tuple[ARFilter, ...]:
+    """One AR filter an output, its variance corrected for the freedom the model has taken.
+
+    **Arguments:**
+
+    - `rows`: the residual with what a model explains taken out.
+    - `lost`: how many parameters that model has.
+    - `highest`: largest order.
+    """
+    outputs = rows.shape[2]
+    total = float(data.mask.sum())
+    share = 1 / (1 - min(lost / outputs / total, 0.5))
+    filters = []
+    for j in range(outputs):
+        series = [s - s.mean() for s in data.series(rows, j)]
+        found = fit_ar(series, highest=highest, criterion="bic")
+        filters.append(ARFilter(found.coefficients, max(found.variance * share, 1e-300)))
+    return tuple(filters)
+
+
+def leftover(data: Data, noise: Sequence[ARFilter], columns: Sequence[int]) -> Rows:
+    """The residual less the best combination of base and some signatures, whitened by `noise`."""
+    picked = data.table[..., list(columns)].astype(float)
+    wide = np.concatenate([data.base, picked], axis=-1)
+    w = whitened(wide, noise, data.mask).reshape(-1, wide.shape[-1])
+    r = whitened(data.residual, noise, data.mask).reshape(-1)
+    size = np.linalg.norm(w, axis=0)
+    size[size == 0] = 1.0
+    w /= size
+    damp = np.full(len(size), 1e-12)
+    damp[data.base.shape[-1] :] += 1e-9
+    theta = np.linalg.solve(w.T @ w + np.diag(damp), w.T @ r) / size
+    return (data.residual - wide @ theta) * data.mask[..., None]
+
+
+def select(white: Whitened, blocks: Blocks, most: int = 12, margin: float = 10.0) -> list[int]:
+    """Blocks picked greedily while each explains more than chance, by a margin.
+
+    Signatures stay as they are; what the blocks picked so far explain is taken out of the products
+    that the next pick needs.
+
+    **Arguments:**
+
+    - `most`: how many at the most.
+    - `margin`: what a block must explain beyond log(samples) for each of its columns.
+    """
+    x, score, price = white.signatures, white.score(), float(np.log(white.count))
+    grouped = [(places, columns, _inner(x, columns)) for places, columns in by_width(blocks)]
+    taken = np.zeros((len(x), 0), x.dtype)
+    residual = white.residual.astype(x.dtype)
+    chosen: list[int] = []
+    for _ in range(most):
+        gain = np.full(len(blocks), -np.inf)
+        for places, columns, inner in grouped:
+            value, freedom = explained_by(inner, score[columns][..., None])
+            gain[places] = value[:, 0] - freedom * price
+        gain[chosen] = -np.inf
+        best = int(gain.argmax())
+        if not gain[best] > margin:
+            break
+        chosen.append(best)
+        own = x[:, list(blocks[best])]
+        own = _basis(own - taken @ (taken.T @ own))
+        taken = np.concatenate([taken, own], axis=1)
+        across = own.T @ x
+        score = score - (own.T @ residual) @ across
+        residual = residual - own @ (own.T @ residual)
+        for _, columns, inner in grouped:
+            part = across[:, columns]
+            inner -= np.einsum("kbi,kbj->bij", part, part)
+    return chosen
+
+
+def _inner(
+    x: Float[np.ndarray, "rows columns"], columns: np.ndarray
+) -> Float[np.ndarray, "blocks width width"]:
+    """Products within each block."""
+    rows = x[:, columns.ravel()].T.reshape(*columns.shape, len(x))
+    return (rows @ rows.transpose(0, 2, 1)).astype(float)
+
+
+def _basis(x: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows rank"]:
+    """Orthonormal columns of the same span; directions that are next to nothing left out."""
+    basis, size, _ = np.linalg.svd(x, full_matrices=False)
+    return basis[:, size**2 > WEAK]
