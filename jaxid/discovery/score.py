@@ -216,7 +216,7 @@ def effective_tests(gram: Gram, blocks: Blocks, draws: int = 400, seed: int = 0)
     for _, columns in by_width(blocks):
         inner = gram.gram[columns[:, :, None], columns[:, None, :]]
         value, freedom = explained_by(inner, noise[columns])
-        for k in np.unique(freedom[freedom > 0]):
+        for k in {int(f) for f in freedom if f > 0}:
             most = value[freedom == k].max(axis=0)
             smallest = np.minimum(smallest, stats.chi2.sf(most, k))
     # The mean of -log(1 - smallest) of m independent tests is 1/m.

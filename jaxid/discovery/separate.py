@@ -1,4 +1,4 @@
-"""Noise told apart from physics: filters estimated with all that could be an effect in the model."""
+"""Noise told apart from physics: its filters are estimated with every effect in the model."""
 
 from collections.abc import Sequence
 
