@@ -1,6 +1,7 @@
 """The blind bench: hidden effects drawn anew, given to `jaxid.discover`, judged by the truth.
 
 python -m benchmarks.hidden_effects [--seed N] [--quick] [--json FILE] [--jobs 2] [--out DIR]
+                                    [--robot scara|two_link]
 """
 
 import argparse
@@ -48,6 +49,7 @@ class Wanted:
     seed: int
     effects: tuple[str, ...]
     noise: str
+    robot: str = "scara"
 
     @property
     def label(self) -> str:
@@ -55,7 +57,7 @@ class Wanted:
         return f"{self.number:03d}_{self.kind}_{'+'.join(self.effects) or self.noise}"
 
 
-def draw_wanted(master: int, quick: bool = False) -> list[Wanted]:
+def draw_wanted(master: int, quick: bool = False, robot: str = "scara") -> list[Wanted]:
     """The cases of one run, shuffled, so that a part of them says something of all."""
     rng = np.random.default_rng(master)
     if quick:
@@ -76,7 +78,7 @@ def draw_wanted(master: int, quick: bool = False) -> list[Wanted]:
     seeds = rng.integers(1, 2**31, len(plain)).tolist()
     order = rng.permutation(len(plain)).tolist()
     return [
-        Wanted(number, plain[k][0], seeds[k], plain[k][1], colours[k])
+        Wanted(number, plain[k][0], seeds[k], plain[k][1], colours[k], robot)
         for number, k in enumerate(order)
     ]
 
@@ -91,7 +93,16 @@ def _pair(rng: np.random.Generator) -> tuple[str, ...]:
 
 def build(wanted: Wanted) -> sim.Case:
     """The case: robot, motions, effects and noise, all from its seed."""
-    return sim.make_case(wanted.seed, wanted.effects, wanted.noise)
+    return sim.make_case(wanted.seed, wanted.effects, wanted.noise, wanted.robot)
+
+
+def start_model(case: sim.Case) -> jaxid.ClosedLoop:
+    """The model that a user would start from: the robot under its controller, without effects."""
+    if case.robot == "scara":
+        return jaxid.scara()
+    law = case.controller
+    assert isinstance(law, sim.PD)
+    return jaxid.two_link(jaxid.control.PD(Kp=list(law.Kp), Kv=list(law.Kv), Kg=list(law.Kg)))
 
 
 def read_case(folder: Path, case: sim.Case) -> tuple[jaxid.Recordings, jaxid.Recordings]:
@@ -211,7 +222,7 @@ def oracle(case: sim.Case, without: Sequence[int], fitting: jaxid.Recordings) ->
     """The fit of who knows the truth: its effects but some, from its values."""
     keep = [e for k, e in enumerate(case.effects) if k not in without]
     base = {name: getattr(case.plant, name) for name in case.plant.base}
-    loop = jaxid.scara().with_values(**base).add(*(in_jaxid(e, case.plant) for e in keep))
+    loop = start_model(case).with_values(**base).add(*(in_jaxid(e, case.plant) for e in keep))
     return jaxid.fit(loop, fitting, jaxid.OEM(start="given", progress=False))
 
 
@@ -324,7 +335,7 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         fitting, held_out = read_case(Path(folder), case)
     started = time.perf_counter()
-    found = jaxid.discover(jaxid.scara(), fitting, validate=held_out, progress=False)
+    found = jaxid.discover(start_model(case), fitting, validate=held_out, progress=False)
     story = {**found.to_dict(), "took": time.perf_counter() - started}
     marks = judge(case, wanted.kind, story)
     record = {"truth": sim.truth(case), "marks": marks, "story": story}
@@ -380,7 +391,7 @@ def _seen(step: Any, case: sim.Case, held_out: jaxid.Recordings) -> dict[str, An
 
 
 def _stepwise_marks(case: sim.Case, kind: str, fitting: jaxid.Recordings) -> dict[str, Any]:
-    first = stepwise.first_effect(jaxid.scara(), fitting)
+    first = stepwise.first_effect(start_model(case), fitting)
     if kind == "clean":
         return {"first": first, "right": first is None}
     true = [true_key(e) for e in case.effects]
@@ -536,18 +547,19 @@ def configure_jax() -> None:
         os.environ.setdefault(name, "1")
 
 
-def settle(out: Path, seed: int | None, quick: bool) -> tuple[int, bool]:
+def settle(out: Path, seed: int | None, quick: bool, robot: str) -> tuple[int, bool, str]:
     """The run that a folder holds already, or a new one, noted there."""
     note = out / "bench.json"
     if note.exists():
         had = json.loads(note.read_text(encoding="utf-8"))
         if seed is not None and seed != had["seed"]:
             raise SystemExit(f"{out} holds a run of seed {had['seed']}: give another folder")
-        return had["seed"], had["quick"]
+        return had["seed"], had["quick"], had["robot"]
     seed = secrets.randbits(31) if seed is None else seed
     out.mkdir(parents=True, exist_ok=True)
-    note.write_text(json.dumps({"seed": seed, "quick": quick}) + "\n", encoding="utf-8")
-    return seed, quick
+    content = json.dumps({"seed": seed, "quick": quick, "robot": robot})
+    note.write_text(content + "\n", encoding="utf-8")
+    return seed, quick, robot
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -558,14 +570,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, help="file for all results")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, help="folder in which a stopped run goes on")
+    parser.add_argument("--robot", choices=("scara", "two_link"), default="scara")
     parser.add_argument("--only", choices=KINDS, help="cases of one kind")
     parser.add_argument("--case", type=int, action="append", help="only the case of this number")
     given = parser.parse_args(arguments)
     out = given.out or Path(tempfile.mkdtemp(prefix="hidden_effects_"))
-    seed, quick = settle(out, given.seed, given.quick)
-    cases = [w for w in draw_wanted(seed, quick) if given.only in (None, w.kind)]
+    seed, quick, robot = settle(out, given.seed, given.quick, given.robot)
+    cases = [w for w in draw_wanted(seed, quick, robot) if given.only in (None, w.kind)]
     cases = [w for w in cases if given.case is None or w.number in given.case]
-    print(f"seed {seed}, {len(cases)} cases, results in {out}", flush=True)
+    print(f"seed {seed}, {robot}, {len(cases)} cases, results in {out}", flush=True)
     configure_jax()
     records = list(_all(cases, out, given.jobs))
     result = summary(records)

@@ -296,7 +296,8 @@ def signatures(
     for stacked, places in _grouped([proposed[k][0] for k in rest]):
         say(f"{stacked.effect_name()} by simulation")
         moved = np.asarray(_finite(loop, stacked, batch, row))
-        columns = (moved - np.asarray(linear.seen[:, :, row])[..., None]).astype(np.float32)
+        with np.errstate(over="ignore"):  # a loop that runs away is left out below
+            columns = (moved - np.asarray(linear.seen[:, :, row])[..., None]).astype(np.float32)
         low, high = _amplitude_bounds(proposed[rest[places[0]]][0])
         for column, place in zip(np.moveaxis(columns, -1, 0), places, strict=True):
             if np.isfinite(column).all():
