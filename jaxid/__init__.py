@@ -1,8 +1,19 @@
 """Identify robot arms from closed-loop recordings, and find the physical effect the model lacks."""
 
+import os as _os
+
 import jax as _jax
 
 _jax.config.update("jax_enable_x64", True)
+# XLA's CPU runtime calls one kernel for each operation of a loop's body, which takes five times as
+# long as the physics of a few joints. Below this size it compiles the whole loop as one kernel; its
+# own limit, 1 kB, is below any robot's. Nothing happens where the user has settings of their own,
+# and results are the same either way.
+if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
+    _os.environ["XLA_FLAGS"] = (
+        _os.environ.get("XLA_FLAGS", "")
+        + " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=16777216"
+    ).strip()
 
 from . import arms as arms  # noqa: E402
 from . import control as control  # noqa: E402

@@ -17,7 +17,8 @@ from .errors import RecordingError
 from .loop import ClosedLoop, Instant, State, instant, rest, settle
 from .recording import Recording, Recordings
 from .smoothing import Band
-from .stepping import flow
+from .stepping import RK4, flow
+from .unrolling import unrolled
 
 
 class Interval(eqx.Module):
@@ -300,6 +301,9 @@ def initial(
     return ravel_pytree(settle(loop, first.t0, rest(loop, q, v), reference, first.label))[0]
 
 
+Scalars = tuple[Float[Array, ""], ...]
+
+
 def advance(
     loop: ClosedLoop, interval: Interval, x: Float[Array, " states"]
 ) -> tuple[Float[Array, " states"], Float[Array, "5 joints"]]:
@@ -312,22 +316,46 @@ def advance(
 
     **Returns:** the state, `(states,)`, and the rows of `SIGNALS`, `(5, joints)`.
     """
+    after, _, seen = _advance(loop, interval, tuple(x), tuple(range(5)))
+    return jnp.stack(after), seen
+
+
+def _advance(
+    loop: ClosedLoop, interval: Interval, y: Scalars, rows: tuple[int, ...]
+) -> tuple[Scalars, Scalars, Float[Array, "rows joints"]]:
+    """The states at an interval's end and start, and signals at its start, state by state."""
     unravel = unflatten(loop)
-    state = unravel(x)
-    if loop.controller.period is not None:
+
+    def begin(interval: Interval, y: Scalars):
+        state = unravel(jnp.stack(y))
+        if loop.controller.period is not None:
+            now = _instant_at(loop, interval, interval.t0, state)
+            asked = _reference(interval, jnp.zeros(()))
+            ticked = loop.controller.tick(now.reading, asked, state.controller)
+            held = jnp.where(interval.tick, ticked, state.controller)
+            state = State(state.q, state.v, state.effects, held)
         now = _instant_at(loop, interval, interval.t0, state)
-        asked = _reference(interval, jnp.zeros(()))
-        ticked = loop.controller.tick(now.reading, asked, state.controller)
-        held = jnp.where(interval.tick, ticked, state.controller)
-        state = State(state.q, state.v, state.effects, held)
-    now = _instant_at(loop, interval, interval.t0, state)
+        seen = (now.command, now.reading.q, now.reading.v, now.a, now.tau)
+        return tuple(ravel_pytree(state)[0]), jnp.stack([seen[row] for row in rows])
 
-    def field(t, y, args):
-        return ravel_pytree(_instant_at(loop, interval, t, unravel(y)).derivative)[0]
+    def rate(t: Float[Array, ""], y: Scalars) -> Scalars:
+        derivative = _instant_at(loop, interval, t, unravel(jnp.stack(y))).derivative
+        return tuple(ravel_pytree(derivative)[0])
 
-    after = flow(loop.stepping, field, interval.t0, interval.h, ravel_pytree(state)[0])
-    seen = jnp.stack([now.command, now.reading.q, now.reading.v, now.a, now.tau])
-    return after, seen
+    held, seen = unrolled(begin, interval, y)(interval, y)
+    written = unrolled(rate, interval.t0, y)
+    if isinstance(loop.stepping.solver, RK4) and loop.stepping.control is None:
+        after = flow(loop.stepping, lambda t, y, _: written(t, y), interval.t0, interval.h, held)
+        return after, y, seen
+    # Implicit methods and step control think of the state as one vector.
+    after = flow(
+        loop.stepping,
+        lambda t, x, _: jnp.stack(written(t, tuple(x))),
+        interval.t0,
+        interval.h,
+        jnp.stack(held),
+    )
+    return tuple(after), y, seen
 
 
 # --- whole runs ---------------------------------------------------------------------------------
@@ -340,11 +368,11 @@ def run(
 ) -> tuple[Float[Array, "points states"], Float[Array, "points 5 joints"]]:
     """One run from a flat initial state: states and signals at every grid point."""
 
-    def body(x, interval):
-        after, seen = advance(loop, interval, x)
-        return after, (x, seen)
+    def body(y, interval):
+        after, before, seen = _advance(loop, interval, y, tuple(range(5)))
+        return after, (jnp.stack(before), seen)
 
-    return jax.lax.scan(body, x0, intervals)[1]
+    return jax.lax.scan(body, tuple(x0), intervals)[1]
 
 
 def run_with_sensitivities(
@@ -356,8 +384,7 @@ def run_with_sensitivities(
 ) -> tuple[Float[Array, "points rows joints"], Float[Array, "points rows joints columns"]]:
     """One run, and the exact derivative of its signals by the loop's free parameters.
 
-    Along the run the discrete loop is linear: with one interval x' = f(x, theta), sensitivities
-    obey S' = df/dx S + df/dtheta. The Jacobians of all intervals come from one `vmap`.
+    All tangents go through the run together, each stage of each step for all at once.
 
     **Arguments:**
 
@@ -366,27 +393,36 @@ def run_with_sensitivities(
       `(states, columns)`.
     - `rows`: which of `SIGNALS`.
     """
-    theta, picked = loop.theta, jnp.asarray(rows)
-    states, _ = run(loop, intervals, x0)
-    n, p = x0.shape[0], theta.shape[0]
+    theta = loop.theta
+    p, columns = theta.shape[0], start.shape[1]
 
-    def one(z, interval):
-        after, seen = advance(loop.with_theta(z[n:]), interval, z[:n])
-        return (after, seen[picked]), seen[picked]
+    def shown(theta, x0):
+        changed = loop.with_theta(theta)
 
-    def linear(x, interval):
-        return jax.jacfwd(one, has_aux=True)(jnp.concatenate([x, theta]), interval)
+        def body(y, interval):
+            after, _, seen = _advance(changed, interval, y, rows)
+            return after, seen
 
-    (after, seen_by), seen = jax.vmap(linear)(states, intervals)
-    extra = start.shape[1] - p
+        return jax.lax.scan(body, tuple(x0), intervals)[1]
 
-    def body(s, jacobian):
-        forced = jnp.pad(jacobian[:, n:], ((0, 0), (0, extra)))
-        return jacobian[:, :n] @ s + forced, s
+    def along(d_theta, d_start):
+        return jax.jvp(shown, (theta, x0), (d_theta, d_start))
 
-    _, history = jax.lax.scan(body, start, after)
-    direct = jnp.pad(seen_by[..., n:], ((0, 0), (0, 0), (0, 0), (0, extra)))
-    return seen, jnp.einsum("krjx,kxp->krjp", seen_by[..., :n], history) + direct
+    return jax.vmap(along, in_axes=1, out_axes=(None, -1))(jnp.eye(p, columns), start)
+
+
+def each(fun: Callable, *args):
+    """The function of every recording: one after the other on a CPU, together on an accelerator.
+
+    One recording's states stay in a core's registers and first cache; a batch's do not.
+
+    **Arguments:**
+
+    - `args`: pytrees with `(recordings,)` before the axes of each leaf.
+    """
+    if jax.default_backend() == "cpu":
+        return jax.lax.map(lambda one: fun(*one), args)
+    return jax.vmap(fun)(*args)
 
 
 @eqx.filter_jit
@@ -398,7 +434,7 @@ def _simulate(loop: ClosedLoop, batch: Batch) -> Simulated:
         tau, q, v, a, delivered = jnp.moveaxis(seen, 1, 0)
         return Simulated(time, q, v, a, tau, delivered, states)
 
-    return jax.vmap(one)(batch.intervals, batch.at, batch.q0, batch.v0, batch.time)
+    return each(one, batch.intervals, batch.at, batch.q0, batch.v0, batch.time)
 
 
 def simulate(

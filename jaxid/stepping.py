@@ -72,8 +72,8 @@ def flow(
     field,
     t0: Float[Array, ""],
     h: Float[Array, ""],
-    x: Float[Array, " states"],
-) -> Float[Array, " states"]:
+    x: PyTree[Float[Array, "..."]],
+) -> PyTree[Float[Array, "..."]]:
     """The state after an interval of `h` seconds; `field(t, x, args)` gives its rate.
 
     A padded interval has no length and leaves the state as it is.

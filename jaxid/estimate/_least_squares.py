@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..loop import ClosedLoop
-from ..simulate import SIGNALS, Batch, initial, run_with_sensitivities
+from ..simulate import SIGNALS, Batch, each, initial, run_with_sensitivities
 from ._base import Status
 
 
@@ -61,7 +61,7 @@ def sensitivity(
         k = seen.shape[0]
         return seen.reshape(k, -1), slopes.reshape(k, len(rows) * n, p + extra)
 
-    seen, slopes = jax.vmap(one)(batch.intervals, batch.at, batch.q0, batch.v0)
+    seen, slopes = each(one, batch.intervals, batch.at, batch.q0, batch.v0)
     measured = jnp.concatenate([getattr(batch, s) for s in signals], axis=-1)
     scale = weights * batch.mask[..., None]
     residual = (measured - seen) * scale
@@ -83,14 +83,14 @@ def filtered_by(
 ) -> Float[Array, "recordings samples outputs columns"]:
     """A(z) x along the samples, for each output its own A; before the first sample all is zero."""
 
-    def body(total, tap):
-        lag, a = tap
+    def body(lag, total):
         earlier = jnp.roll(x, lag, axis=1)
         known = jnp.arange(x.shape[1]) >= lag
-        return total + a[:, None] * jnp.where(known[:, None, None], earlier, 0.0), None
+        return total + noise[:, lag, None] * jnp.where(known[:, None, None], earlier, 0.0)
 
-    taps = (jnp.arange(noise.shape[1]), noise.T)
-    return jax.lax.scan(body, jnp.zeros_like(x), taps)[0]
+    # White noise, the usual case, has no second tap: what is not there is not paid for.
+    used = jnp.max(jnp.where(noise != 0, jnp.arange(noise.shape[1]), 0))
+    return jax.lax.fori_loop(1, used + 1, body, noise[:, 0, None] * x)
 
 
 def absorb_start(found: Sensitivity, free: Float[Array, " recordings"]) -> Sensitivity:

@@ -1,0 +1,287 @@
+"""Small array programs written out as programs of scalars, which compilers do far better with.
+
+The physics of a few joints is a hundred sums and products. Written with arrays of two, most of
+its time and of its compilation goes into moving pairs of numbers; written out, a batch of
+recordings or of tangents becomes the one array axis that is left, and one instruction of a
+processor handles eight of them.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+# Arrays above this size are left whole: writing a spline's fifty knots out would only make
+# programs long.
+WHOLE = 32
+
+ELEMENTWISE = frozenset(
+    "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type "
+    "copy copy_p cos cosh div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite "
+    "le lgamma log log1p logistic lt max min mul ne neg nextafter not or pow rem round rsqrt select_n "
+    "sign sin sinh sqrt square stop_gradient sub tan tanh xor".split()
+)
+INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
+
+
+def unrolled(fun: Callable[..., Any], *like: Any) -> Callable[..., Any]:
+    """The same function, traced once and evaluated scalar by scalar.
+
+    Operations that it does not know how to write out (loops, decompositions, functions with a
+    derivative of their own) and large arrays are evaluated as they are.
+
+    **Arguments:**
+
+    - `fun`: a function of pytrees of arrays.
+    - `like`: arguments of the shapes that it will be called with.
+    """
+    closed, shape = jax.make_jaxpr(fun, return_shape=True)(*like)
+    structure = jax.tree.structure(shape)
+    consts = [_Value.of(c) for c in closed.consts]
+    for const in consts:
+        # Here, not where they are first needed, which may be inside a loop.
+        const.scalars() if const.small else const.whole()
+
+    def evaluate(*args: Any) -> Any:
+        inputs = [_Value.of(leaf) for leaf in jax.tree.leaves(args)]
+        outputs = _Writer().run(closed.jaxpr, consts, inputs)
+        return jax.tree.unflatten(structure, [value.whole() for value in outputs])
+
+    return evaluate
+
+
+class _Value:
+    """An array as one tracer, as an object array of scalars, or as both once both were needed."""
+
+    def __init__(self, shape, dtype, array=None, scalars=None):
+        self.shape, self.dtype = tuple(shape), dtype
+        self._array, self._scalars = array, scalars
+
+    @classmethod
+    def of(cls, array) -> "_Value":
+        if not isinstance(array, jax.core.Tracer):
+            array = np.asarray(array)
+        return cls(np.shape(array), jnp.result_type(array), array=array)
+
+    def whole(self):
+        if self._array is None:
+            flat = [jnp.asarray(x, self.dtype) for x in self._scalars.ravel()]
+            if self.shape == ():
+                self._array = flat[0]
+            elif not flat:
+                self._array = jnp.zeros(self.shape, self.dtype)
+            else:
+                self._array = jnp.stack(flat).reshape(self.shape)
+        return self._array
+
+    def scalars(self) -> np.ndarray:
+        if self._scalars is None:
+            self._scalars = np.empty(self.shape, object)
+            for at in np.ndindex(self.shape):
+                self._scalars[at] = self._array[at]
+        return self._scalars
+
+    @property
+    def small(self) -> bool:
+        return math.prod(self.shape) <= WHOLE
+
+
+def _known(x) -> bool:
+    return isinstance(x, np.generic)
+
+
+def _as_it_is(eqn, inputs: list[_Value]) -> list[_Value]:
+    """One equation evaluated with whole arrays."""
+    given = eqn.primitive.get_bind_params(eqn.params)
+    # Before jax 0.10 functions among the parameters came apart from the rest.
+    functions, params = given if isinstance(given, tuple) else ((), given)
+    out = eqn.primitive.bind(*functions, *(v.whole() for v in inputs), **params)
+    out = out if eqn.primitive.multiple_results else [out]
+    shapes = [v.aval for v in eqn.outvars]
+    return [_Value(s.shape, s.dtype, array=o) for s, o in zip(shapes, out, strict=True)]
+
+
+class _Writer:
+    """Evaluates a jaxpr, each scalar expression once."""
+
+    def __init__(self):
+        self.seen: dict[Any, Any] = {}
+        # Keys hold identities, so what they name must live as long as they do.
+        self.alive: list[Any] = []
+
+    def run(self, jaxpr: Jaxpr, consts: list[_Value], args: list[_Value]) -> list[_Value]:
+        values: dict[Any, _Value] = {}
+
+        def look_up(atom) -> _Value:
+            if isinstance(atom, Literal):
+                return _Value(atom.aval.shape, atom.aval.dtype, np.asarray(atom.val, atom.aval.dtype))
+            return values[atom]
+
+        values.update(zip(jaxpr.constvars, consts, strict=True))
+        values.update(zip(jaxpr.invars, args, strict=True))
+        for eqn in jaxpr.eqns:
+            inputs = [look_up(atom) for atom in eqn.invars]
+            values.update(zip(eqn.outvars, self.equation(eqn, inputs), strict=True))
+        return [look_up(atom) for atom in jaxpr.outvars]
+
+    def equation(self, eqn, inputs: list[_Value]) -> list[_Value]:
+        name = eqn.primitive.name
+        if name in INLINED:
+            inner = eqn.params[INLINED[name]]
+            if isinstance(inner, ClosedJaxpr):
+                return self.run(inner.jaxpr, [_Value.of(c) for c in inner.consts], inputs)
+        shapes = [v.aval for v in eqn.outvars]
+        if all(math.prod(s.shape) <= WHOLE for s in shapes) and all(v.small for v in inputs):
+            written = self.written(eqn, name, inputs)
+            if written is not None:
+                pieces = [written] if not eqn.primitive.multiple_results else written
+                return [
+                    _Value(s.shape, s.dtype, scalars=w.reshape(s.shape))
+                    for s, w in zip(shapes, pieces, strict=True)
+                ]
+        return _as_it_is(eqn, inputs)
+
+    def written(self, eqn, name: str, inputs: list[_Value]):
+        """The scalars of what an equation gives; None where it cannot be written out."""
+        p = eqn.params
+        if name in ELEMENTWISE:
+            return self.elementwise(eqn, [v.scalars() for v in inputs])
+        if name in MOVES:
+            return MOVES[name](p, *[v.scalars() for v in inputs])
+        if name == "dot_general":
+            return self.product(p, *inputs)
+        if name == "reduce_sum":
+            return self.total(p, inputs[0])
+        if name in ("scatter", "scatter-add", "scatter-mul"):
+            return self.scattered(name, p, *inputs)
+        return None
+
+    def elementwise(self, eqn, arrays: list[np.ndarray]) -> np.ndarray:
+        arrays = np.broadcast_arrays(*arrays)
+        out = np.empty(arrays[0].shape, object)
+        for at in np.ndindex(out.shape):
+            out[at] = self.scalar(eqn.primitive, eqn.params, [a[at] for a in arrays])
+        return out
+
+    def scalar(self, primitive, params, args: list[Any]):
+        name = primitive.name
+        if all(_known(a) for a in args):
+            if name in ARITHMETIC:
+                return ARITHMETIC[name](*args)
+            if name == "convert_element_type":
+                return np.asarray(args[0], params["new_dtype"])[()]
+        if name == "add" and _known(args[0]) and args[0] == 0:
+            return args[1]
+        if name in ("add", "sub") and _known(args[1]) and args[1] == 0:
+            return args[0]
+        if name == "mul" and any(_known(a) and a == 1 for a in args):
+            return args[1] if _known(args[0]) and args[0] == 1 else args[0]
+        key = (
+            name,
+            tuple(sorted((k, str(v)) for k, v in params.items())),
+            tuple((a.dtype, a.item()) if _known(a) else id(a) for a in args),
+        )
+        if key not in self.seen:
+            self.alive.extend(args)
+            self.seen[key] = primitive.bind(*args, **params)
+        return self.seen[key]
+
+    def times(self, a, b):
+        return self.scalar(jax.lax.mul_p, {}, [a, b])
+
+    def plus(self, a, b):
+        return self.scalar(jax.lax.add_p, {}, [a, b])
+
+    def product(self, p, left: _Value, right: _Value):
+        (contract_left, contract_right), (batch_left, batch_right) = p["dimension_numbers"]
+        if batch_left or batch_right or left.dtype != right.dtype:
+            return None
+        a = np.moveaxis(left.scalars(), contract_left, range(len(contract_left)))
+        b = np.moveaxis(right.scalars(), contract_right, range(len(contract_right)))
+        shared, depth = a.shape[: len(contract_left)], math.prod(a.shape[: len(contract_left)])
+        rows, columns = a.shape[len(shared) :], b.shape[len(shared) :]
+        a, b = a.reshape(depth, -1), b.reshape(depth, -1)
+        out = np.empty((a.shape[1], b.shape[1]), object)
+        for i, j in np.ndindex(out.shape):
+            out[i, j] = np.zeros((), left.dtype)[()]
+            for k in range(depth):
+                out[i, j] = self.plus(out[i, j], self.times(a[k, i], b[k, j]))
+        return out.reshape(rows + columns)
+
+    def total(self, p, value: _Value):
+        array = value.scalars()
+        axes = tuple(p["axes"])
+        moved = np.moveaxis(array, axes, range(len(axes)))
+        kept = moved.shape[len(axes) :]
+        out = np.full(kept, np.zeros((), value.dtype)[()], object)
+        for at in np.ndindex(moved.shape[: len(axes)]):
+            for to in np.ndindex(kept):
+                out[to] = self.plus(out[to], moved[at + to])
+        return out
+
+    def scattered(self, name, p, operand: _Value, indices: _Value, updates: _Value):
+        """One element set, added to or multiplied, at a place known when the program is made."""
+        numbers, rank = p["dimension_numbers"], len(operand.shape)
+        at = indices.scalars()
+        one = tuple(numbers.inserted_window_dims) == tuple(range(rank)) and at.shape == (rank,)
+        if not one or updates.shape or not all(_known(i) for i in at):
+            return None
+        place = tuple(int(at[numbers.scatter_dims_to_operand_dims.index(d)]) for d in range(rank))
+        if any(not 0 <= i < n for i, n in zip(place, operand.shape, strict=True)):
+            return None
+        out, update = operand.scalars().copy(), updates.scalars()[()]
+        if name == "scatter-add":
+            update = self.plus(out[place], update)
+        elif name == "scatter-mul":
+            update = self.times(out[place], update)
+        out[place] = update
+        return out
+
+
+def _broadcast(p, x):
+    shape, where = p["shape"], p["broadcast_dimensions"]
+    spread = [1] * len(shape)
+    for d, n in zip(where, x.shape, strict=True):
+        spread[d] = n
+    return np.broadcast_to(x.reshape(spread), shape)
+
+
+def _slice(p, x):
+    strides = p["strides"] or (1,) * x.ndim
+    return x[
+        tuple(
+            slice(a, b, s)
+            for a, b, s in zip(p["start_indices"], p["limit_indices"], strides, strict=True)
+        )
+    ]
+
+
+def _split(p, x):
+    return np.split(x, np.cumsum(p["sizes"])[:-1], axis=p["axis"])
+
+
+MOVES: dict[str, Callable[..., Any]] = {
+    "broadcast_in_dim": _broadcast,
+    "reshape": lambda p, x: x.reshape(p["new_sizes"]),
+    "squeeze": lambda p, x: np.squeeze(x, p["dimensions"]),
+    "expand_dims": lambda p, x: np.expand_dims(x, p["dimensions"]),
+    "transpose": lambda p, x: np.transpose(x, p["permutation"]),
+    "rev": lambda p, x: np.flip(x, p["dimensions"]),
+    "slice": _slice,
+    "split": _split,
+    "concatenate": lambda p, *xs: np.concatenate(xs, axis=p["dimension"]),
+    "stack": lambda p, *xs: np.stack(xs, axis=p["axis"]),
+}
+# What is worth knowing already when a program is written: indices, and zeros.
+ARITHMETIC: dict[str, Callable[..., Any]] = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "neg": lambda a: -a,
+    "lt": lambda a, b: a < b,
+    "eq": lambda a, b: a == b,
+}
