@@ -3,6 +3,7 @@
 import dataclasses
 import html
 import json
+import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -26,6 +27,7 @@ from ..noise import ARFilter
 from ..parameters import Bounds, list_parameters, read_values, write_values
 from ..progress import working
 from ..recording import Recording, Recordings
+from ..saved import save
 from ..simulate import compared
 from .compare import Comparison, compare
 from .diagnose import Diagnosis, Verdict, diagnose, effect_parameters
@@ -145,6 +147,17 @@ class Discovery(eqx.Module):
         curve = self.diagnosis.predicted(self.diagnosis.where[0])
         assert isinstance(curve, Curve)
         return curve
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Writes the story to one file, from which `jaxid.load` gives it back.
+
+        **Arguments:**
+
+        - `path`: by convention with the ending `.jaxid`; a file that is there is replaced.
+
+        **Raises:** `SaveError` where it cannot be written.
+        """
+        return save(self, path)
 
     def report(self, path: str | Path) -> Path:
         """Writes the story as one self-contained HTML page.
