@@ -6,14 +6,12 @@ python -m benchmarks.hidden_effects [--seed N] [--quick] [--json FILE] [--jobs 2
 
 import argparse
 import json
-import multiprocessing
 import os
 import secrets
 import tempfile
 import time
 import traceback
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +21,7 @@ from scipy import signal, stats
 
 import jaxid
 from jaxid import effects as fx
+from jaxid.campaign import Campaign, Failed
 from jaxid.parameters import list_parameters
 from tests import independent as sim
 
@@ -315,19 +314,14 @@ def failed(kind: str, marks: dict[str, Any]) -> bool:
 # --- one case ------------------------------------------------------------------------------------
 
 
-def run_case(wanted: Wanted, out: str) -> dict[str, Any]:
-    """Makes, solves and judges one case, and stores what came of it."""
+def run_case(wanted: Wanted) -> dict[str, Any]:
+    """Makes, solves and judges one case."""
     started = time.perf_counter()
     try:
         record = _solve(wanted)
     except Exception:
         record = {"error": traceback.format_exc()}
-    record = {**asdict(wanted), **record, "seconds": time.perf_counter() - started}
-    path = Path(out) / f"{wanted.label}.json"
-    draft = path.with_suffix(".part")
-    draft.write_text(json.dumps(record, indent=1, default=float) + "\n", encoding="utf-8")
-    draft.replace(path)
-    return record
+    return {**asdict(wanted), **record, "seconds": time.perf_counter() - started}
 
 
 def _solve(wanted: Wanted) -> dict[str, Any]:
@@ -580,7 +574,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     cases = [w for w in cases if given.case is None or w.number in given.case]
     print(f"seed {seed}, {robot}, {len(cases)} cases, results in {out}", flush=True)
     configure_jax()
-    records = list(_all(cases, out, given.jobs))
+    with Campaign(out, {"seed": seed, "quick": quick}) as campaign:
+        records = list(_all(cases, campaign, given.jobs))
     result = summary(records)
     print()
     show_summary(result)
@@ -592,24 +587,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         given.json.write_text(json.dumps(content, indent=1, default=float) + "\n", encoding="utf-8")
 
 
-def _all(cases: Sequence[Wanted], out: Path, jobs: int) -> Iterable[dict[str, Any]]:
+def _all(cases: Sequence[Wanted], campaign: Campaign, jobs: int) -> Iterable[dict[str, Any]]:
     """Stored cases first, then the others as they end."""
-    todo = []
-    for wanted in cases:
-        path = out / f"{wanted.label}.json"
-        if path.exists():
-            record = json.loads(path.read_text(encoding="utf-8"))
-            print(row(record), flush=True)
-            yield record
-        else:
-            todo.append(wanted)
-    spawn = multiprocessing.get_context("spawn")
-    # A worker keeps every program that it has compiled: a new one now and then bounds its memory.
-    with ProcessPoolExecutor(jobs, mp_context=spawn, max_tasks_per_child=10) as pool:
-        for future in as_completed([pool.submit(run_case, w, str(out)) for w in todo]):
-            record = future.result()
-            print(row(record), flush=True)
-            yield record
+    wanted = {case.label: case for case in cases}
+    for label, record in campaign.run(run_case, wanted, jobs=jobs):
+        if isinstance(record, Failed):
+            record = {**asdict(wanted[label]), "error": record.reason}
+        print(row(record), flush=True)
+        yield record
 
 
 if __name__ == "__main__":

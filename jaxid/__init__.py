@@ -45,5 +45,7 @@ from .recording import read as read  # noqa: E402
 from .robots import emps as emps  # noqa: E402
 from .robots import scara as scara  # noqa: E402
 from .robots import two_link as two_link  # noqa: E402
+from .saved import load as load  # noqa: E402
+from .saved import save as save  # noqa: E402
 from .simulate import simulate as simulate  # noqa: E402
 from .stepping import Stepping as Stepping  # noqa: E402

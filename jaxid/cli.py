@@ -315,7 +315,7 @@ def discover(
         Path | None, typer.Option(help="Write the story to this HTML file, which needs no network.")
     ] = None,
     resume: Annotated[
-        Path | None, typer.Option(help="Save each step here, and go on from what it holds.")
+        Path | None, typer.Option(help="Save each step in this folder, and go on from there.")
     ] = None,
     column: Column = None,
     unit: Unit = None,
@@ -330,13 +330,13 @@ def discover(
     Examples:
       jaxid discover fit_1.csv fit_2.csv --validate held_out.csv
       jaxid discover run_*.csv --validate held_1.csv held_2.csv --robot my_robot.py:loop \\
-            --unit q=deg --json story.json --report story.html --resume steps.json
+            --unit q=deg --json story.json --report story.html --resume steps
     """
     from .discovery import discover as run_discover
 
     kept = "" if resume is None else f"; the same command goes on from the steps in {resume}"
     with _sentences(kept):
-        _check_outputs(json_file, report, resume)
+        _check_outputs(json_file, report)
         loop = _with_controller(load_robot(robot), controller)
         held_out = list(validate or [])
         _check_apart(files, held_out)

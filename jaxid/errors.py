@@ -1,6 +1,7 @@
 """What jaxid raises and warns with: every message is one sentence that says what to do."""
 
 import importlib
+import textwrap
 from types import ModuleType
 
 
@@ -20,12 +21,33 @@ class FitError(JaxidError, RuntimeError):
     """An estimate was asked for that the data or the settings do not allow."""
 
 
+class SaveError(JaxidError, ValueError):
+    """A saved result, or a piece of a campaign, cannot be written or read."""
+
+
 class MissingExtraError(JaxidError, ImportError):
     """A package is needed that only an optional extra of jaxid installs."""
 
 
 class JaxidWarning(UserWarning):
     """Something is likely, not surely, a mistake."""
+
+
+def sentence(source: str, what: str, remedy: str) -> str:
+    """One printable sentence about a file or recording, whatever it holds.
+
+    **Arguments:**
+
+    - `source`: the file, or the name of the recording.
+    - `what`: what is wrong, and where.
+    - `remedy`: what to do about it.
+    """
+    said = textwrap.shorten(_printable(f"{what}; {remedy}"), 320, placeholder=" ...")
+    return f"{_printable(source)}: {said}."
+
+
+def _printable(text: str) -> str:
+    return "".join(character if character.isprintable() else " " for character in text)
 
 
 def require(module: str, extra: str) -> ModuleType:

@@ -1,7 +1,9 @@
 """How well a model predicts recordings, and where it fails."""
 
 import html
+import os
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -21,6 +23,7 @@ from ..estimate.oem import pieces_of
 from ..loop import ClosedLoop
 from ..noise import autocorrelation
 from ..recording import Recording, Recordings
+from ..saved import save
 from ..simulate import Simulated, band_of, compared, simulate
 
 
@@ -134,6 +137,17 @@ class Comparison(eqx.Module):
         table = self.error_percent
         return figures.error_bars(list(table.columns), list(table.index), table.to_numpy())
 
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Writes the comparison to one file, from which `jaxid.load` gives it back.
+
+        **Arguments:**
+
+        - `path`: by convention with the ending `.jaxid`; a file that is there is replaced.
+
+        **Raises:** `SaveError` where it cannot be written.
+        """
+        return save(self, path)
+
     def to_dict(self) -> dict[str, Any]:
         """Relative errors as plain JSON."""
         return {
@@ -228,9 +242,10 @@ def _errors(loop: ClosedLoop, recordings: Recordings, runs: tuple[Simulated, ...
     tables["position"] = relative_errors(
         recordings, position, [r.q - np.asarray(run.q) for r, run in pairs]
     )
-    # A velocity that was not measured is derived from position without delay.
+    # A velocity that was not measured is derived from position without delay, at every sample.
     velocity = [
-        filtered(r, Filtering(cutoff=r.rate / 10)).v if r.v is None else r.v for r in recordings
+        filtered(r, Filtering(cutoff=r.rate / 10, rate=r.rate, trim=0.0)).v if r.v is None else r.v
+        for r in recordings
     ]
     tables["velocity"] = relative_errors(
         recordings,

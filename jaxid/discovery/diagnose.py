@@ -1,7 +1,9 @@
 """Every effect of the catalogue held against the residual of one fit, without a refit."""
 
 import html
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -23,6 +25,7 @@ from ..noise import ARFilter
 from ..parameters import write_values
 from ..progress import working
 from ..recording import Recordings
+from ..saved import save
 from ..simulate import Batch, prepare, with_substeps
 from .compare import Comparison
 from .linear import Linearised, base_columns, linearise
@@ -258,6 +261,17 @@ class Diagnosis(eqx.Module):
             band,
             y_name=f"residual of joint {curve.joint}",
         )
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Writes the diagnosis to one file, from which `jaxid.load` gives it back.
+
+        **Arguments:**
+
+        - `path`: by convention with the ending `.jaxid`; a file that is there is replaced.
+
+        **Raises:** `SaveError` where it cannot be written.
+        """
+        return save(self, path)
 
     def to_dict(self) -> dict[str, Any]:
         """The ranking and where the model fails, as plain JSON."""

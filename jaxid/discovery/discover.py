@@ -2,7 +2,7 @@
 
 import dataclasses
 import html
-import json
+import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -17,6 +17,8 @@ from jaxtyping import Float
 from scipy import stats
 
 from .. import figures
+from ..archive import classes_of
+from ..campaign import Campaign
 from ..effects import AbstractEffect, Curve
 from ..effects import catalogue as known
 from ..errors import ModelError
@@ -26,6 +28,7 @@ from ..noise import ARFilter
 from ..parameters import Bounds, list_parameters, read_values, write_values
 from ..progress import working
 from ..recording import Recording, Recordings
+from ..saved import save
 from ..simulate import compared
 from .compare import Comparison, compare
 from .diagnose import Diagnosis, Verdict, diagnose, effect_parameters
@@ -145,6 +148,17 @@ class Discovery(eqx.Module):
         curve = self.diagnosis.predicted(self.diagnosis.where[0])
         assert isinstance(curve, Curve)
         return curve
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Writes the story to one file, from which `jaxid.load` gives it back.
+
+        **Arguments:**
+
+        - `path`: by convention with the ending `.jaxid`; a file that is there is replaced.
+
+        **Raises:** `SaveError` where it cannot be written.
+        """
+        return save(self, path)
 
     def report(self, path: str | Path) -> Path:
         """Writes the story as one self-contained HTML page.
@@ -271,9 +285,11 @@ def discover(
     - `method`: of the fits.
     - `significance`: corrected p-value below which something counts as missing.
     - `most`: how many effects to add at the most.
-    - `resume`: a file in which every step is saved as it ends, and from which it goes on.
+    - `resume`: a folder in which every step is saved as it ends, and from which the same call
+      goes on; it is made where it is not there.
 
-    **Raises:** `FitError`, `ModelError`, `RecordingError` where model and recordings do not fit.
+    **Raises:** `FitError`, `ModelError`, `RecordingError` where model and recordings do not fit;
+    `SaveError` where the folder holds steps of another call.
     """
     started = time.perf_counter()
     recordings = Recordings.of(recordings)
@@ -281,15 +297,19 @@ def discover(
     search = _Search(
         recordings, held_out, tuple(catalogue), method or OEM(), significance, progress
     )
-    with working(f"discovery on {loop.name}", progress) as say:
-        journal = _Journal(None if resume is None else Path(resume), loop, recordings)
-        steps = journal.replay(search, loop, say)
+    plan = {"loop": loop, "search": search.plan(), "most": most}
+    with (
+        working(f"discovery on {loop.name}", progress) as say,
+        Campaign(resume, plan, classes_of(loop) | _classes_in(search.catalogue)) as campaign,
+    ):
+        steps = [campaign.piece("start", lambda: search.begin(loop, say))]
         verdict: Outcome | None = None
         while verdict is None:
-            verdict, step = search.turn(steps, most, say)
+            verdict, step = campaign.piece(
+                f"turn {len(steps)}", lambda: search.turn(steps, most, say)
+            )
             if step is not None:
                 steps.append(step)
-                journal.save(steps)
         steps, removed = search.prune(steps, say)
     notes = _notes(steps, most)
     return Discovery(verdict, tuple(steps), removed, notes, time.perf_counter() - started)
@@ -314,6 +334,16 @@ class _Search(eqx.Module):
     method: OEM
     significance: float
     progress: bool
+
+    def plan(self) -> dict[str, Any]:
+        """What the steps follow from, beside the starting model."""
+        return {
+            "recordings": self.recordings,
+            "validate": self.held_out,
+            "catalogue": [_entry(entry) for entry in self.catalogue],
+            "method": _quiet(self.method),
+            "significance": self.significance,
+        }
 
     def begin(self, loop: ClosedLoop, say: Callable[[str], None]) -> Step:
         """The starting model, fitted and diagnosed."""
@@ -439,6 +469,18 @@ class _Search(eqx.Module):
             steps = [s for k, s in enumerate(steps[:-1]) if k != weakest] + [again]
 
 
+def _entry(entry: Any) -> Any:
+    """An entry of a catalogue as a plan names it: classes and functions by their names."""
+    name = getattr(entry, "__qualname__", None)
+    return entry if name is None else f"{entry.__module__}.{name}"
+
+
+def _classes_in(catalogue: Sequence[Any]) -> set[type]:
+    """The classes of effects that a catalogue names; what its functions make is not known yet."""
+    given = {entry for entry in catalogue if isinstance(entry, type)}
+    return given.union(*(classes_of(entry) for entry in catalogue))
+
+
 def _quiet(method: OEM) -> OEM:
     return dataclasses.replace(method, progress=False)
 
@@ -549,79 +591,3 @@ def _is_amplitude(loop: ClosedLoop, place: int) -> bool:
             return p.declaration.linear
         start += p.size
     return False
-
-
-# --- saved steps --------------------------------------------------------------------------------
-
-
-class _Journal(eqx.Module):
-    """A file with the steps so far, so that an interrupted discovery goes on where it was."""
-
-    path: Path | None
-    loop: ClosedLoop
-    recordings: Recordings
-
-    def save(self, steps: Sequence[Step]) -> None:
-        """Writes the steps at once: a new file, then its name."""
-        if self.path is None:
-            return
-        content = {
-            "robot": self.loop.name,
-            "recordings": list(self.recordings.names),
-            "added": [
-                {
-                    "effect": type(step.added).__name__,
-                    "fields": _fields(step.added),
-                    "alike": [list(key) for key in step.alike],
-                    "theta": step.fit.theta.tolist(),
-                }
-                for step in steps
-                if step.added is not None
-            ],
-        }
-        draft = self.path.with_suffix(self.path.suffix + ".part")
-        draft.write_text(json.dumps(content, indent=1), encoding="utf-8")
-        draft.replace(self.path)
-
-    def replay(self, search: _Search, loop: ClosedLoop, say: Callable[[str], None]) -> list[Step]:
-        """The steps that the file holds, fitted again from their own values; or the first."""
-        if self.path is None or not self.path.exists():
-            return [search.begin(loop, say)]
-        try:
-            content = json.loads(self.path.read_text(encoding="utf-8"))
-            same = content["recordings"] == list(self.recordings.names)
-            entries = content["added"]
-        except (ValueError, KeyError, TypeError) as error:
-            raise ModelError(
-                f"{self.path} is not a journal of a discovery ({error!r}): delete it to start anew"
-            ) from error
-        if not same:
-            raise ModelError(
-                f"{self.path} belongs to other recordings ({', '.join(content['recordings'])}): "
-                "give another file, or delete it to start anew"
-            )
-        steps = [search.begin(loop, say)]
-        classes = {c.__name__: c for c in search.catalogue if isinstance(c, type)}
-        for entry in entries:
-            if entry["effect"] not in classes:
-                raise ModelError(
-                    f"{self.path} holds the effect {entry['effect']}, which is not in this "
-                    "catalogue: add it, or delete the file to start anew"
-                )
-            effect = classes[entry["effect"]](**entry["fields"])
-            grown = steps[-1].fit.loop.add(effect).with_theta(jnp.asarray(entry["theta"]))
-            say(f"again {effect.effect_name()}")
-            method = search.whitened_method(steps[-1].diagnosis)
-            found = fit(grown, self.recordings, method)
-            name = _name(effect.effect_name(), getattr(effect, "joint", None))
-            alike = tuple((n, j) for n, j in entry["alike"])
-            steps.append(search.step(f"+ {name}", found, added=found.loop.effects[-1], alike=alike))
-        return steps
-
-
-def _fields(effect: AbstractEffect) -> dict[str, Any]:
-    values = {}
-    for field in dataclasses.fields(effect):
-        value = getattr(effect, field.name)
-        values[field.name] = np.asarray(value).tolist() if hasattr(value, "dtype") else value
-    return values

@@ -3,7 +3,9 @@
 import abc
 import enum
 import html
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +17,7 @@ from jaxtyping import Float
 from .. import figures
 from ..loop import ClosedLoop
 from ..recording import Recording, Recordings
+from ..saved import save
 
 
 class Status(enum.Enum):
@@ -105,6 +108,17 @@ class Fit(eqx.Module):
             "iterations": self.iterations,
             "seconds": self.seconds,
         }
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Writes the fit to one file, from which `jaxid.load` gives it back.
+
+        **Arguments:**
+
+        - `path`: by convention with the ending `.jaxid`; a file that is there is replaced.
+
+        **Raises:** `SaveError` where it cannot be written.
+        """
+        return save(self, path)
 
     def plot(self) -> go.Figure:
         """The parameters with their deviations."""

@@ -2,10 +2,9 @@
 
 import difflib
 import reprlib
-import textwrap
 from collections.abc import Iterable
 
-from ..errors import RecordingError
+from ..errors import RecordingError, sentence
 
 
 def problem(source: str, what: str, remedy: str) -> RecordingError:
@@ -17,8 +16,7 @@ def problem(source: str, what: str, remedy: str) -> RecordingError:
     - `what`: what is wrong, and where.
     - `remedy`: what to do about it.
     """
-    sentence = textwrap.shorten(_printable(f"{what}; {remedy}"), 320, placeholder=" ...")
-    return RecordingError(f"{_printable(source)}: {sentence}.")
+    return RecordingError(sentence(source, what, remedy))
 
 
 def brief(value: object) -> str:
@@ -33,7 +31,3 @@ def near(name: str, candidates: Iterable[str]) -> str:
     by_folded = {candidate.casefold(): candidate for candidate in candidates}
     close = difflib.get_close_matches(name.casefold(), list(by_folded), n=1, cutoff=0.7)
     return f" (did you mean {brief(by_folded[close[0]])}?)" if close else ""
-
-
-def _printable(text: str) -> str:
-    return "".join(character if character.isprintable() else " " for character in text)

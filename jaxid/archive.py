@@ -1,0 +1,465 @@
+"""Results as bytes and back: JSON and NumPy arrays in a zip, nothing in them executed.
+
+The zip holds `manifest.json`, its SHA-256 in `manifest.sha256`, and `0.npy`, `1.npy`, … for the
+arrays. Members are stored, not compressed: what such a file unpacks to cannot be larger than it.
+The manifest lists modules as class name and fields, each after those it refers to.
+"""
+
+import dataclasses
+import enum
+import hashlib
+import importlib.metadata
+import io
+import json
+import math
+import types
+import typing
+import zipfile
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from .errors import SaveError, sentence
+
+# Raised whenever an older jaxid could not read what this one writes; older formats stay readable.
+FORMAT = 1
+
+# Everything but arrays; a story of many steps has about one megabyte.
+_LARGEST_MANIFEST = 256 * 2**20
+_PACKAGES = ("jaxid-robotics", "jax", "jaxlib", "equinox", "diffrax", "numpy", "scipy")
+
+# A class by the package it comes from ("" for jaxid itself) and its name.
+Registry = Mapping[tuple[str, str], type]
+
+
+def versions() -> dict[str, str]:
+    """The versions that a result depends on."""
+    found = {}
+    for package in _PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def origin(cls: type) -> tuple[str, str]:
+    """How a class is called in a file: its package and name; a user's own, its module and name."""
+    package = cls.__module__.partition(".")[0]
+    where = {"jaxid": "", "diffrax": "diffrax"}.get(package, cls.__module__)
+    return where, cls.__name__
+
+
+def registered(classes: Iterable[type]) -> dict[tuple[str, str], type]:
+    """Classes by the names they have in files."""
+    return {origin(cls): cls for cls in classes}
+
+
+def classes_of(tree: Any) -> set[type]:
+    """The classes of all modules in a tree: what restoring it takes."""
+    found: set[type] = set()
+    waiting = [tree]
+    while waiting:
+        value = waiting.pop()
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            found.add(type(value))
+            waiting += [getattr(value, field.name) for field in dataclasses.fields(value)]
+        elif isinstance(value, dict):
+            waiting += value.values()
+        elif isinstance(value, (tuple, list)):
+            waiting += value
+        elif isinstance(value, enum.Enum):
+            found.add(type(value))
+    return found
+
+
+# --- writing ------------------------------------------------------------------------------------
+
+
+def pack(value: Any) -> bytes:
+    """A tree of modules, containers, numbers, text, arrays and tables as the bytes of a file.
+
+    The same tree gives the same bytes.
+
+    **Raises:** `SaveError` for what cannot be written without Python code, such as a function.
+    """
+    packer = _Packer()
+    root = packer.node(value, "result")
+    manifest = {
+        "format": FORMAT,
+        "versions": versions(),
+        "root": root,
+        "objects": packer.objects,
+        "arrays": [digest for digest, _ in packer.arrays],
+    }
+    text = json.dumps(manifest, indent=1, allow_nan=False).encode()
+    members = {"manifest.json": text, "manifest.sha256": _digest(text).encode()}
+    members |= {f"{k}.npy": content for k, (_, content) in enumerate(packer.arrays)}
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in members.items():
+            # A date would make two equal results differ.
+            archive.writestr(zipfile.ZipInfo(name), content)
+    return buffer.getvalue()
+
+
+class _Packer:
+    """Turns values into JSON, and collects modules and arrays, each once."""
+
+    def __init__(self) -> None:
+        self.objects: list[dict[str, Any]] = []
+        self.arrays: list[tuple[str, bytes]] = []
+        # The tree keeps what it holds alive, so that an identity stays one.
+        self._seen: dict[int, Any] = {}
+
+    def node(self, value: Any, where: str) -> Any:
+        """The JSON of a value; `where` names it in a complaint."""
+        match value:
+            case enum.Enum():
+                package, name = origin(type(value))
+                return {"enum": name, "package": package, "member": value.name}
+            case None | bool() | str():
+                return value
+            case np.generic() if not isinstance(value, (float, bool)):
+                return self.node(value.item(), where)
+            case int():
+                return int(value)
+            case float():
+                return float(value) if math.isfinite(value) else {"float": str(float(value))}
+            case tuple():
+                return {"tuple": [self.node(x, f"{where}[{k}]") for k, x in enumerate(value)]}
+            case list():
+                return [self.node(x, f"{where}[{k}]") for k, x in enumerate(value)]
+            case frozenset():
+                return {"set": [self.node(x, where) for x in sorted(value)]}
+            case dict():
+                pairs = [[self.node(k, where), self.node(x, where)] for k, x in value.items()]
+                return {"dict": pairs}
+            case pd.DataFrame():
+                return self._frame(value, where)
+            case np.ndarray() | jax.Array():
+                return self._once(value, lambda: self._array(value, where))
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            return self._once(value, lambda: self._object(value, where))
+        raise SaveError(
+            f"{where} is {value!r}, which a file of JSON and arrays cannot hold: save a result "
+            "without it"
+        )
+
+    def _once(self, value: Any, make: Callable[[], Any]) -> Any:
+        if id(value) not in self._seen:
+            self._seen[id(value)] = make()
+        return self._seen[id(value)]
+
+    def _object(self, value: Any, where: str) -> Any:
+        package, name = origin(type(value))
+        fields = {}
+        for field in dataclasses.fields(value):
+            held = getattr(value, field.name)
+            try:
+                fields[field.name] = self.node(held, f"{where}.{field.name}")
+            except SaveError:
+                # A function or the like: it comes back where the class itself gives it.
+                if held is not field.default:
+                    raise
+        self.objects.append({"class": name, "package": package, "fields": fields})
+        return {"object": len(self.objects) - 1}
+
+    def _array(self, value: Any, where: str) -> Any:
+        array = np.asarray(value)
+        if array.dtype.kind not in "fiub":
+            raise SaveError(f"{where} is an array of {array.dtype}: only numbers can be saved")
+        buffer = io.BytesIO()
+        # One byte order, so that equal results are equal files.
+        plain = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False))
+        np.lib.format.write_array(buffer, plain.reshape(array.shape), allow_pickle=False)
+        content = buffer.getvalue()
+        self.arrays.append((_digest(content), content))
+        return {"array": len(self.arrays) - 1, "jax": isinstance(value, jax.Array)}
+
+    def _frame(self, frame: pd.DataFrame, where: str) -> Any:
+        levels = [frame.index.get_level_values(k) for k in range(frame.index.nlevels)]
+        return {
+            "frame": self._array(frame.to_numpy(np.float64), where),
+            "columns": [str(name) for name in frame.columns],
+            "index": [[str(label) for label in level] for level in levels],
+            "names": [None if n is None else str(n) for n in frame.index.names],
+        }
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+# --- reading ------------------------------------------------------------------------------------
+
+
+def unpack(content: bytes, source: str, registry: Registry) -> Any:
+    """What `pack` was given.
+
+    **Arguments:**
+
+    - `content`: the bytes of the file. `source`: what messages call it.
+    - `registry`: the classes that may be in it; no others are looked for, and nothing is imported.
+
+    **Raises:** `SaveError` for whatever is wrong with the file.
+    """
+    try:
+        return _Unpacker(source, registry).read(content)
+    except SaveError:
+        raise
+    # What a forged file makes constructors raise is theirs to choose.
+    except Exception as error:
+        raise _complaint(
+            source,
+            f"is damaged ({type(error).__name__}: {error})",
+            "save or copy it again",
+        ) from error
+
+
+def _complaint(source: str, what: str, remedy: str) -> SaveError:
+    return SaveError(sentence(source, what, remedy))
+
+
+class _Unpacker:
+    def __init__(self, source: str, registry: Registry) -> None:
+        self.source, self.registry = source, registry
+        self.arrays: list[np.ndarray] = []
+        self.objects: list[Any] = []
+        self._device: dict[int, jax.Array] = {}
+
+    def read(self, content: bytes) -> Any:
+        members = self._members(content)
+        if len(members["manifest.json"]) > _LARGEST_MANIFEST:
+            raise self._damaged("its manifest is larger than any that jaxid writes")
+        manifest = json.loads(members["manifest.json"])
+        self._check_format(manifest)
+        if members.get("manifest.sha256", b"") != _digest(members["manifest.json"]).encode():
+            raise self._damaged("its manifest was changed after it was written")
+        for k, digest in enumerate(manifest["arrays"]):
+            self.arrays.append(self._array(members.get(f"{k}.npy", b""), digest, f"{k}.npy"))
+        if len(members) != len(self.arrays) + 2:
+            raise self._damaged("it holds members that its manifest does not name")
+        for entry in manifest["objects"]:
+            self.objects.append(self._object(entry))
+        return self.value(manifest["root"])
+
+    def _members(self, content: bytes) -> dict[str, bytes]:
+        try:
+            archive = zipfile.ZipFile(io.BytesIO(content))
+            entries = archive.infolist()
+            if any(e.compress_type != zipfile.ZIP_STORED or e.flag_bits & 1 for e in entries):
+                raise self._damaged("it was packed again by another program")
+            # Entries that share their bytes unpack to more than the file has.
+            if sum(e.file_size for e in entries) > len(content):
+                raise self._damaged("it would unpack to more than its own size")
+            if len({e.filename for e in entries}) < len(entries):
+                raise self._damaged("it holds a member twice")
+            members = {e.filename: archive.read(e) for e in entries}
+        except SaveError:
+            raise
+        except Exception as error:  # zipfile raises nearly anything on broken files
+            raise _complaint(
+                self.source,
+                f"is cut off, damaged or no saved result ({type(error).__name__}: {error})",
+                "save or copy it again",
+            ) from error
+        if "manifest.json" not in members:
+            raise _complaint(self.source, "is a zip but no saved result", "check its name")
+        return members
+
+    def _check_format(self, manifest: Any) -> None:
+        written = manifest.get("format") if isinstance(manifest, dict) else None
+        if type(written) is not int or written < 1:
+            raise self._damaged("its manifest names no format")
+        if written > FORMAT:
+            by = manifest.get("versions", {})
+            by = by.get("jaxid-robotics", "") if isinstance(by, dict) else ""
+            raise _complaint(
+                self.source,
+                f"is of format {written} (jaxid {by}), and this jaxid reads formats up to {FORMAT}",
+                "upgrade jaxid",
+            )
+
+    def _damaged(self, what: str) -> SaveError:
+        return _complaint(self.source, f"is damaged: {what}", "save or copy it again")
+
+    def _array(self, content: bytes, digest: str, name: str) -> np.ndarray:
+        if _digest(content) != digest:
+            raise self._damaged(f"{name} is missing or was changed after it was written")
+        array = npy(content)
+        if array.dtype.kind not in "fiub":
+            raise self._damaged(f"{name} holds {array.dtype}")
+        return array
+
+    def _class(self, package: str, name: str) -> type:
+        found = self.registry.get((package, name))
+        if found is None and package not in ("", "diffrax"):
+            # A class of the user's, which may have moved to another file of theirs.
+            same = [c for (p, n), c in self.registry.items() if p and n == name]
+            found = same[0] if len(same) == 1 else None
+        if found is None and package not in ("", "diffrax"):
+            raise _complaint(
+                self.source,
+                f"holds an object of your class {name} (of {package})",
+                f"pass it: jaxid.load(path, classes=[{name}])",
+            )
+        if found is None:
+            raise _complaint(
+                self.source,
+                f"holds a {name}, which this version of {package or 'jaxid'} does not have",
+                "load it with the version that wrote it",
+            )
+        return found
+
+    def _object(self, entry: dict[str, Any]) -> Any:
+        cls = self._class(entry["package"], entry["class"])
+        given = {name: self.value(node) for name, node in entry["fields"].items()}
+        fields = {field.name for field in dataclasses.fields(cls)}
+        for name in given:
+            if name not in fields:
+                raise _complaint(
+                    self.source,
+                    f"holds {cls.__name__} with a field {name}, which it does not have here",
+                    "load it with the version that wrote it",
+                )
+        made = _rebuild(cls, given)
+        for name, hint in _hints(cls).items():
+            if name in fields and not agrees(getattr(made, name), hint):
+                raise self._damaged(f"{cls.__name__}.{name} is not what it should be")
+        return made
+
+    def value(self, node: Any) -> Any:
+        """What a node of the manifest stands for."""
+        match node:
+            case None | bool() | int() | float() | str():
+                return node
+            case list():
+                return [self.value(x) for x in node]
+            case {"object": int(k)}:
+                return self.objects[k]
+            case {"array": int(k), "jax": bool(on_device)}:
+                return self._on_device(k) if on_device else self.arrays[k]
+            case {"tuple": list(items)}:
+                return tuple(self.value(x) for x in items)
+            case {"set": list(items)}:
+                return frozenset(self.value(x) for x in items)
+            case {"dict": list(pairs)}:
+                return {self.value(k): self.value(x) for k, x in pairs}
+            case {"float": str(text)} if text in ("nan", "inf", "-inf"):
+                return float(text)
+            case {"enum": str(name), "package": str(package), "member": str(member)}:
+                cls = self._class(package, name)
+                if issubclass(cls, enum.Enum) and member in cls.__members__:
+                    return cls[member]
+            case {"frame": frame, "columns": columns, "index": index, "names": names}:
+                return self._frame(frame, columns, index, names)
+        raise self._damaged("its manifest holds something of no known kind")
+
+    def _on_device(self, k: int) -> jax.Array:
+        # What shared an array shares it again.
+        if k not in self._device:
+            self._device[k] = jnp.asarray(self.arrays[k])
+        return self._device[k]
+
+    def _frame(self, frame: Any, columns: Any, index: Any, names: Any) -> pd.DataFrame:
+        if len(index) == 1:
+            labels = pd.Index(index[0], name=names[0])
+        else:
+            labels = pd.MultiIndex.from_arrays(index, names=names)
+        return pd.DataFrame(self.value(frame), index=labels, columns=columns)
+
+
+def npy(content: bytes) -> np.ndarray:
+    """The array in the bytes of a `.npy`, whose header must tell the truth about their number.
+
+    `numpy.load` sets aside whatever a header asks for before it reads.
+
+    **Raises:** `ValueError` where it does not, or for Python objects.
+    """
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    header = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    if version not in header:
+        raise ValueError(f"version {version} of .npy is not supported")
+    shape, fortran, dtype = header[version](stream)
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects, which are refused")
+    size, there = math.prod(shape) * dtype.itemsize, len(content) - stream.tell()
+    if any(n < 0 for n in shape) or size != there:
+        raise ValueError(f"its header promises {size} bytes of data and {there} are there")
+    values = np.frombuffer(content, dtype, count=math.prod(shape), offset=stream.tell())
+    shaped = values.reshape(shape[::-1]).T if fortran else values.reshape(shape)
+    return shaped.copy()
+
+
+def _rebuild(cls: type, given: Mapping[str, Any]) -> Any:
+    """An object of its fields as they were, past converters and with the checks that follow them.
+
+    A field that the file does not know, for it is older, has its default.
+    """
+    made = object.__new__(cls)
+    for field in dataclasses.fields(cls):
+        if field.name in given:
+            value = _or_default(given[field.name], field.default)
+        elif field.default is not dataclasses.MISSING:
+            value = field.metadata.get("converter", lambda x: x)(field.default)
+        elif field.default_factory is not dataclasses.MISSING:
+            value = field.default_factory()
+        else:
+            raise ValueError(f"{cls.__name__} needs a value for {field.name}")
+        object.__setattr__(made, field.name, value)
+    for base in cls.__mro__:
+        if "__check_init__" in vars(base):
+            base.__check_init__(made)  # type: ignore[attr-defined]
+    return made
+
+
+def _or_default(value: Any, default: Any) -> Any:
+    """The default itself where the value is the same: equinox prints a field that `is` not it."""
+    if type(value) is not type(default):
+        return value
+    if isinstance(value, (str, int, float)):
+        return default if repr(value) == repr(default) else value
+    same = isinstance(value, eqx.Module) and eqx.tree_equal(value, default) is True
+    return default if same else value
+
+
+def _hints(cls: type) -> dict[str, Any]:
+    try:
+        return typing.get_type_hints(cls)
+    except Exception:  # annotations of a user's class may name what only a type checker sees
+        return {}
+
+
+def agrees(value: Any, hint: Any) -> bool:
+    """Whether a value may stand in a field with that annotation; what is not known may."""
+    if hint in (Any, None) or isinstance(hint, (str, typing.TypeVar)):
+        return hint is not None or value is None
+    made_of, of = typing.get_origin(hint), typing.get_args(hint)
+    if made_of in (typing.Union, types.UnionType):
+        return any(agrees(value, one) for one in of)
+    if made_of is typing.Literal:
+        return value in of
+    if made_of is tuple:
+        if not isinstance(value, tuple):
+            return False
+        if len(of) == 2 and of[1] is Ellipsis:
+            return all(agrees(one, of[0]) for one in value)
+        return len(of) == len(value) and all(map(agrees, value, of))
+    plain = made_of or hint
+    if plain in (int, float) or hasattr(plain, "array_type"):
+        # A number of a module becomes an array, and an array one of more axes, under `vmap`.
+        numbers = (int, float, np.ndarray, jax.Array)
+        return isinstance(value, numbers) and not isinstance(value, bool)
+    if isinstance(plain, type):
+        return isinstance(value, plain)
+    return True

@@ -1,0 +1,322 @@
+"""Long work in pieces: each finished one is a file, and who is killed goes on where it was."""
+
+import contextlib
+import hashlib
+import json
+import multiprocessing
+import os
+import re
+import reprlib
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from . import archive
+from .errors import JaxidError, SaveError, sentence
+from .files import write_whole
+from .saved import registry
+
+try:
+    import fcntl
+except ImportError:  # Windows has other locks; there nobody watches over a second process
+    fcntl = None
+
+# What a computation says about its input, alike in every run; anything else is not its result.
+_VERDICTS = (JaxidError, ArithmeticError, np.linalg.LinAlgError)
+
+
+class Failed(eqx.Module):
+    """What a piece gave that could not be computed: why, in words."""
+
+    reason: str = eqx.field(static=True)
+
+
+class Campaign:
+    """A folder of finished pieces of one piece of work.
+
+    Every piece is written at once under another name and moved to its own, with checksums; what
+    was written is never computed again, and what is damaged is set aside and computed anew. One
+    process at a time works in a folder.
+
+    Used as a context:
+
+    ```python
+    with Campaign("draws", {"seed": 7, "loop": loop, "recordings": recordings}) as campaign:
+        draws = dict(campaign.run(draw, {f"draw {k}": k for k in range(1000)}))
+    ```
+
+    **Arguments:**
+
+    - `folder`: made where it is not there; None to keep nothing.
+    - `plan`: what the pieces follow from: seeds, settings, models, recordings. A folder is gone on
+      with only for the same plan and the same versions of jaxid and what it stands on.
+    - `classes`: modules of your own that pieces may hold.
+
+    **Raises:** `SaveError` where the folder belongs to other work, or another process is at it.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str] | None,
+        plan: Mapping[str, Any],
+        classes: Iterable[type] = (),
+    ) -> None:
+        self.folder = None if folder is None else Path(folder)
+        self.plan = plan
+        self.damaged: list[str] = []
+        self._classes = set(classes)
+        self._lock: int | None = None
+        self._key = ""
+
+    def __enter__(self) -> "Campaign":
+        if self.folder is None:
+            return self
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except (OSError, ValueError) as error:
+            raise _problem(
+                self.folder, f"cannot be used ({error})", "give a folder, or the name of a new one"
+            ) from error
+        self._take_lock()
+        try:
+            self._check_plan()
+            for draft in self.folder.glob(".*.part"):
+                draft.unlink(missing_ok=True)
+        except BaseException:
+            self._drop_lock()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._drop_lock()
+
+    def piece(self, name: str, work: Callable[[], Any]) -> Any:
+        """What a piece gave: read where it is there, else computed and written.
+
+        **Arguments:**
+
+        - `name`: different for every piece.
+        - `work`: computes it; its result is a module, or numbers, text, arrays and containers of
+          these.
+        """
+        found, value = self._stored(name)
+        return value if found else self._keep(name, work())
+
+    def run(
+        self, work: Callable[[Any], Any], pieces: Mapping[str, Any], *, jobs: int = 1
+    ) -> Iterator[tuple[str, Any]]:
+        """Name and result of every piece: those that are there first, then the others as they end.
+
+        A piece that raises an error of jaxid's, or of arithmetic, gives a `Failed`, and the others
+        go on.
+
+        **Arguments:**
+
+        - `work`: from an argument to a result; with several jobs, a function of a module.
+        - `pieces`: arguments by name.
+        - `jobs`: processes that work at the same time.
+        """
+        left = {}
+        for name, argument in pieces.items():
+            found, value = self._stored(name)
+            if found:
+                yield name, value
+            else:
+                left[name] = argument
+        if jobs == 1:
+            for name, argument in left.items():
+                yield name, self._keep(name, _tried(work, argument))
+        elif left:
+            yield from self._in_processes(work, left, jobs)
+
+    # --- one piece ------------------------------------------------------------------------------
+
+    def path(self, name: str) -> Path:
+        """Where a piece is written."""
+        assert self.folder is not None
+        readable = re.sub(r"[^A-Za-z0-9+._-]+", "_", name)[:80].strip(".")
+        return self.folder / f"{readable}-{hashlib.sha256(name.encode()).hexdigest()[:12]}.piece"
+
+    def _stored(self, name: str) -> tuple[bool, Any]:
+        if self.folder is None:
+            return False, None
+        path = self.path(name)
+        if not path.exists():
+            return False, None
+        try:
+            held = archive.unpack(path.read_bytes(), str(path), registry(self._classes))
+            if held["piece"] != name or held["plan"] != self._key:
+                raise SaveError("of another plan")
+        except (SaveError, KeyError, TypeError):
+            # Kept for whoever wants to know what happened to it, out of the way of a new one.
+            path.replace(path.with_suffix(".damaged"))
+            self.damaged.append(name)
+            return False, None
+        return True, held["value"]
+
+    def _keep(self, name: str, value: Any) -> Any:
+        # What a catalogue's own functions made can be read back by whoever has made it once.
+        self._classes |= archive.classes_of(value)
+        if self.folder is not None and not isinstance(value, _Died):
+            content = archive.pack({"piece": name, "plan": self._key, "value": value})
+            write_whole(self.path(name), content)
+        return value
+
+    # --- several processes ----------------------------------------------------------------------
+
+    def _in_processes(
+        self, work: Callable[[Any], Any], left: Mapping[str, Any], jobs: int
+    ) -> Iterator[tuple[str, Any]]:
+        """Only this process writes: what a killed one has left running cannot do a piece again."""
+        ended: set[str] = set()
+        try:
+            for name, value in _from_pool(work, left, jobs):
+                ended.add(name)
+                yield name, self._keep(name, value)
+        except BrokenProcessPool:
+            # One of them took its process down; which, shows when each works alone.
+            for name in [name for name in left if name not in ended]:
+                try:
+                    [(_, value)] = _from_pool(work, {name: left[name]}, 1)
+                except BrokenProcessPool:
+                    value = _Died("the process that worked on it was ended from outside")
+                yield name, self._keep(name, value)
+
+    # --- the folder -----------------------------------------------------------------------------
+
+    def _take_lock(self) -> None:
+        assert self.folder is not None
+        if fcntl is None:
+            return
+        handle = os.open(self.folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(handle)
+            raise _problem(
+                self.folder, "another process works in this folder", "wait for it, or end it"
+            ) from error
+        self._lock = handle
+
+    def _drop_lock(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def _check_plan(self) -> None:
+        assert self.folder is not None
+        plan = {
+            "format": archive.FORMAT,
+            "versions": archive.versions(),
+            "plan": {name: _described(value) for name, value in self.plan.items()},
+        }
+        text = json.dumps(plan, indent=1, sort_keys=True) + "\n"
+        self._key = hashlib.sha256(text.encode()).hexdigest()
+        path = self.folder / "plan.json"
+        if not path.exists():
+            if any(self.folder.glob("*.piece")):
+                raise _problem(self.folder, "holds pieces and no plan.json", "give an empty folder")
+            write_whole(path, text.encode())
+            return
+        try:
+            had = json.loads(path.read_text(encoding="utf-8"))
+            changed = [
+                *_changed(had["plan"], plan["plan"]),
+                *_changed(had["versions"], plan["versions"]),
+            ]
+            changed += ["format"] if had["format"] != plan["format"] else []
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise _problem(
+                path, f"is no plan of a campaign ({error!r})", "give another folder"
+            ) from error
+        if changed:
+            raise _problem(
+                self.folder,
+                f"holds the pieces of other work (not the same: {', '.join(changed)})",
+                "give another folder, or what it was begun with",
+            )
+
+
+class _Died(Failed):
+    """A failure that says nothing about the piece: the next run tries it again."""
+
+
+def _problem(path: Path, what: str, remedy: str) -> SaveError:
+    return SaveError(sentence(str(path), what, remedy))
+
+
+def _described(value: Any) -> dict[str, str]:
+    """A part of a plan, to be compared and, shortly, to be read."""
+    return {
+        "sha256": hashlib.sha256(archive.pack(value)).hexdigest(),
+        "shown": reprlib.Repr().repr(value),
+    }
+
+
+def _changed(had: Mapping[str, Any], has: Mapping[str, Any]) -> list[str]:
+    def digest(entry: Any) -> Any:
+        return entry.get("sha256") if isinstance(entry, dict) else entry
+
+    names = [*has, *(name for name in had if name not in has)]
+    return [n for n in names if digest(had.get(n, "")) != digest(has.get(n, ""))]
+
+
+def _tried(work: Callable[[Any], Any], argument: Any) -> Any:
+    try:
+        return work(argument)
+    except _VERDICTS as error:
+        return Failed(f"{type(error).__name__}: {error}")
+
+
+def _from_pool(
+    work: Callable[[Any], Any], left: Mapping[str, Any], jobs: int
+) -> Iterator[tuple[str, Any]]:
+    spawn = multiprocessing.get_context("spawn")
+    # A worker keeps every program that it has compiled: a new one now and then bounds its memory.
+    pool = ProcessPoolExecutor(
+        jobs, mp_context=spawn, max_tasks_per_child=10, initializer=_end_with_parent
+    )
+    waiting = iter(left.items())
+    running: dict[Future[Any], str] = {}
+    try:
+        while True:
+            while len(running) < jobs and (following := next(waiting, None)) is not None:
+                running[pool.submit(_tried, work, following[1])] = following[0]
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                name = running.pop(future)
+                yield name, future.result()
+    finally:
+        processes = list((getattr(pool, "_processes", None) or {}).values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        if running:
+            for process in processes:
+                process.kill()
+
+
+def _end_with_parent() -> None:
+    """Ends this worker when the process that started it is gone; Ctrl-C is for that one."""
+    with contextlib.suppress(ValueError):
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

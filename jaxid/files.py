@@ -1,0 +1,41 @@
+"""Files that are there whole or not at all."""
+
+import contextlib
+import os
+import secrets
+from pathlib import Path
+
+from .errors import SaveError, sentence
+
+
+def write_whole(path: str | os.PathLike[str], content: bytes) -> Path:
+    """Writes a file under another name first, so that who is killed meanwhile leaves the old one.
+
+    **Arguments:**
+
+    - `path`: its folder must exist; a file that is there is replaced.
+    - `content`: all of it.
+
+    **Raises:** `SaveError` where it cannot be written.
+    """
+    path = Path(path)
+    # In the same folder: a name can be moved at once only within one file system.
+    draft = path.parent / f".{secrets.token_hex(8)}.part"
+    try:
+        with open(draft, "xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(draft, path)
+    except (OSError, ValueError) as error:
+        raise SaveError(
+            sentence(
+                str(path),
+                f"cannot be written ({error})",
+                "choose a folder that exists, has room and is yours to write in",
+            )
+        ) from error
+    finally:
+        with contextlib.suppress(OSError, ValueError):
+            draft.unlink(missing_ok=True)
+    return path

@@ -1,0 +1,95 @@
+"""Saved results read back: `jaxid.load`."""
+
+import enum
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import equinox as eqx
+
+from . import archive
+from .errors import SaveError, sentence
+from .files import write_whole
+
+# Larger than any story of a day's recordings, and small enough to be read on a laptop.
+LARGEST = 4 * 2**30
+
+
+def save(result: eqx.Module, path: str | os.PathLike[str]) -> Path:
+    """Writes a result to one file, which is there whole or not at all.
+
+    **Arguments:**
+
+    - `result`: a fit, comparison, diagnosis, discovery or loop.
+    - `path`: by convention with the ending `.jaxid`; a file that is there is replaced.
+
+    **Returns:** the path.
+
+    **Raises:** `SaveError` where it cannot be written.
+    """
+    return write_whole(path, archive.pack(result))
+
+
+def load(
+    path: str | os.PathLike[str], classes: Iterable[type] = (), *, largest: int = LARGEST
+) -> Any:
+    """Reads what `save` wrote: the same result, whose methods work as before.
+
+    Nothing in the file is executed, and no class is looked for but jaxid's own and those given.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `classes`: arms, effects, controllers or methods of your own that the result holds.
+    - `largest`: size in bytes above which a file is refused; about three times that much memory
+      is used.
+
+    **Raises:** `SaveError` for a file that is cut off, edited, too large, from a later version, or
+    of a class that was not given.
+    """
+    source = str(path)
+    try:
+        size = os.path.getsize(path)
+        if size > largest:
+            raise SaveError(
+                sentence(
+                    source,
+                    f"has {size} bytes, more than the {largest} that are read",
+                    f"pass largest={size} if it is yours",
+                )
+            )
+        # One byte more than asked for shows a file that grows, or a device without an end.
+        with open(path, "rb") as file:
+            content = file.read(size + 1)
+    except (OSError, ValueError, MemoryError) as error:
+        raise SaveError(
+            sentence(source, f"cannot be opened ({error})", "check the path and permissions")
+        ) from error
+    if len(content) != size:
+        raise SaveError(
+            sentence(source, "is no plain file, or is being written", "give a saved result")
+        )
+    return archive.unpack(content, source, registry(classes))
+
+
+def registry(classes: Iterable[type] = ()) -> dict[tuple[str, str], type]:
+    """The classes that a file may hold: jaxid's public ones, diffrax's steps, and those given."""
+    loaded = _below(eqx.Module) | _below(enum.Enum)
+    ours = {c for c in loaded if c.__module__.startswith("jaxid.")}
+    bases = (diffrax.AbstractSolver, diffrax.AbstractStepSizeController, diffrax.AbstractAdjoint)
+    theirs = {c for c in vars(diffrax).values() if isinstance(c, type) and issubclass(c, bases)}
+    known = {c for c in ours | theirs if not c.__name__.startswith("_")}
+    return archive.registered([*known, *classes])
+
+
+def _below(cls: type) -> set[type]:
+    """All subclasses that were imported."""
+    found: set[type] = set()
+    waiting = [cls]
+    while waiting:
+        below = set(waiting.pop().__subclasses__()) - found
+        found |= below
+        waiting += below
+    return found
