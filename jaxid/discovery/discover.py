@@ -24,7 +24,7 @@ from ..effects import catalogue as known
 from ..errors import ModelError
 from ..estimate import OEM, Fit, SeparablePEM, fit
 from ..loop import ClosedLoop
-from ..noise import ARFilter
+from ..noise import ARFilter, fit_ar
 from ..parameters import Bounds, list_parameters, read_values, write_values
 from ..progress import working
 from ..recording import Recording, Recordings
@@ -349,12 +349,11 @@ class _Search(eqx.Module):
         """The starting model, fitted and diagnosed."""
         say("fit of the starting model")
         first = fit(loop, self.recordings, _quiet(self.method))
+        # Where noise is strongly coloured, plain output error leaves the parameters so far off
+        # that what follows would have to explain that.
+        again = fit(first.loop, self.recordings, self.alternating())
         say("diagnosis of the starting model")
-        step = self.step("start", first)
-        # With the noise known, once more: where it is strongly coloured, plain output error leaves
-        # the parameters so far off that what follows would have to explain that.
-        again = fit(first.loop, self.recordings, self.whitened_method(step.diagnosis))
-        return self.step("start", again) if again.succeeded else step
+        return self.step("start", again if again.succeeded else first)
 
     def step(self, label: str, found: Fit, **extra: Any) -> Step:
         """A step with its diagnosis and its error on held-out recordings."""
@@ -389,6 +388,7 @@ class _Search(eqx.Module):
         gained = self.criterion(last.fit, diagnosis.noise) - best.criterion
         if _curve_is_better(diagnosis, gained):
             return "outside_catalogue", None
+        contenders[0] = best = self.settled(best, say)
         say(f"diagnosis with {_name(best.name, best.joint)}")
         step = self.step(
             f"+ {_name(best.name, best.joint)}",
@@ -419,6 +419,28 @@ class _Search(eqx.Module):
                     tried.append(Contender(*verdict.key, refitted, value))
             found += sorted(tried, key=lambda c: c.criterion)[:1]
         return sorted(found, key=lambda c: c.criterion)
+
+    def settled(self, best: Contender, say: Callable[[str], None]) -> Contender:
+        """The best contender with noise filters of its own, and with its held shapes if they matter.
+
+        The filters it was judged by knew its effect from a signature only, so some of it may have
+        passed for noise. And what was screened at a finite setting has shapes that only a good fit
+        can tell (how stiff a backlash's contact is): held at a wrong value they leave something to
+        explain.
+        """
+        loop = best.fit.loop
+        held = () if amplitudes(loop.effects[-1]) else _held_shapes(loop)
+        found = [best.fit]
+        for names in [(), held] if held else [()]:
+            say(f"refit of {_name(best.name, best.joint)} with its own noise")
+            found.append(fit(loop.free(*names), self.recordings, self.alternating()))
+        chosen = min((f for f in found if f.succeeded), key=_bic, default=best.fit)
+        return Contender(best.name, best.joint, chosen, best.criterion)
+
+    def alternating(self) -> SeparablePEM:
+        """The method with noise filters estimated along with the parameters."""
+        method = dataclasses.replace(_quiet(self.method), start="given")
+        return SeparablePEM(method, criterion="bic", highest=30, rounds=3)
 
     def whitened_method(self, diagnosis: Diagnosis) -> SeparablePEM:
         """The method with the noise filters of a diagnosis: efficient where noise is coloured."""
@@ -512,6 +534,29 @@ def _with_forms(leading: Sequence[Verdict], forms: Sequence[Verdict]) -> list[Ve
             and form.evidence > 0.5 * verdict.evidence
         ]
     return chosen
+
+
+def _bic(found: Fit) -> float:
+    """Likelihood of a fit with noise filters of its own, and the price of what it estimates."""
+    joints = found.residuals[0].shape[1]
+    count = sum(len(r) for r in found.residuals)
+    filters = [
+        fit_ar([r[:, j] for r in found.residuals], highest=30, criterion="bic")
+        for j in range(joints)
+    ]
+    spread = sum(count * np.log(max(f.variance, 1e-300)) for f in filters)
+    free = len(found.names) + sum(f.order for f in filters)
+    return float(spread + free * np.log(count * joints))
+
+
+def _held_shapes(loop: ClosedLoop) -> tuple[str, ...]:
+    """Names of the last effect's parameters that no fit estimates unless told to."""
+    last = ("effects", len(loop.effects) - 1)
+    return tuple(
+        p.name
+        for p in loop.parameters
+        if p.where.steps[:2] == last and not p.declaration.free  # type: ignore[attr-defined]
+    )
 
 
 def _inside(effect: AbstractEffect) -> AbstractEffect:
