@@ -31,6 +31,9 @@ except ImportError:  # Windows has other locks; there nobody watches over a seco
 
 # What a computation says about its input, alike in every run; anything else is not its result.
 _VERDICTS = (JaxidError, ArithmeticError, np.linalg.LinAlgError)
+# Pieces that a worker does before a new one takes its place: it keeps every program that it has
+# compiled. (The executor's own max_tasks_per_child can wait for ever, CPython issue 115634.)
+LIFE = 10
 
 
 class Failed(eqx.Module):
@@ -183,9 +186,12 @@ class Campaign:
         """Only this process writes: what a killed one has left running cannot do a piece again."""
         ended: set[str] = set()
         try:
-            for name, value in _from_pool(work, left, jobs):
-                ended.add(name)
-                yield name, self._keep(name, value)
+            names = list(left)
+            for at in range(0, len(names), LIFE * jobs):
+                batch = {name: left[name] for name in names[at : at + LIFE * jobs]}
+                for name, value in _from_pool(work, batch, jobs):
+                    ended.add(name)
+                    yield name, self._keep(name, value)
         except BrokenProcessPool:
             # One of them took its process down; which, shows when each works alone.
             for name in [name for name in left if name not in ended]:
@@ -285,10 +291,7 @@ def _from_pool(
     work: Callable[[Any], Any], left: Mapping[str, Any], jobs: int
 ) -> Iterator[tuple[str, Any]]:
     spawn = multiprocessing.get_context("spawn")
-    # A worker keeps every program that it has compiled: a new one now and then bounds its memory.
-    pool = ProcessPoolExecutor(
-        jobs, mp_context=spawn, max_tasks_per_child=10, initializer=_end_with_parent
-    )
+    pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_end_with_parent)
     waiting = iter(left.items())
     running: dict[Future[Any], str] = {}
     try:

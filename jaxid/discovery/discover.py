@@ -421,7 +421,7 @@ class _Search(eqx.Module):
         return sorted(found, key=lambda c: c.criterion)
 
     def settled(self, best: Contender, say: Callable[[str], None]) -> Contender:
-        """The best contender with noise filters of its own, and with its held shapes if they matter.
+        """The best contender with noise filters of its own, and its held shapes if they matter.
 
         The filters it was judged by knew its effect from a signature only, so some of it may have
         passed for noise. And what was screened at a finite setting has shapes that only a good fit
