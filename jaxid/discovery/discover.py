@@ -19,7 +19,7 @@ from scipy import stats
 from .. import figures
 from ..archive import classes_of
 from ..campaign import Campaign
-from ..effects import AbstractEffect, Curve
+from ..effects import AbstractEffect, AbstractTransmission, Curve
 from ..effects import catalogue as known
 from ..errors import ModelError
 from ..estimate import OEM, Fit, SeparablePEM, fit
@@ -370,24 +370,21 @@ class _Search(eqx.Module):
         last = steps[-1]
         done = "explained" if last.added is not None else "adequate"
         diagnosis = last.diagnosis
-        if diagnosis.adequate:
-            return done, None
-        entries = [
-            v
-            for v in diagnosis.ranking
-            if v.possible and v.p_value < self.significance and v.evidence > 0
-        ]
+        matters = self.matters(steps)
+        entries = [v for v in diagnosis.ranking if matters(v) and v.possible and v.evidence > 0]
         # A weak entry that no refit confirms is chance unless a curve finds something as well.
-        failing = "outside_catalogue" if diagnosis.depends_on() else done
-        if not entries or len(steps) > most:
+        failing = "outside_catalogue" if any(map(matters, diagnosis.where)) else done
+        if len(steps) > most or not (entries or failing != done):
             return failing, None
         contenders = self.refit(last, _with_forms(_leading(entries), diagnosis.forms), say)
-        best = contenders[0] if contenders else None
-        if best is None or best.criterion >= self.criterion(last.fit, diagnosis.noise):
+        if failing != done and not self.convinces(contenders, last):
+            # A drive and a link that come apart are far from what a small setting shows of them.
+            tried = {(c.name, c.joint) for c in contenders}
+            others = [v for v in _transmissions(diagnosis) if v.key not in tried]
+            contenders = sorted(contenders + self.refit(last, others, say), key=_criterion)
+        if not self.convinces(contenders, last):
             return failing, None
-        gained = self.criterion(last.fit, diagnosis.noise) - best.criterion
-        if _curve_is_better(diagnosis, gained):
-            return "outside_catalogue", None
+        best = contenders[0]
         contenders[0] = best = self.settled(best, say)
         say(f"diagnosis with {_name(best.name, best.joint)}")
         step = self.step(
@@ -398,6 +395,24 @@ class _Search(eqx.Module):
             contenders=tuple(contenders),
         )
         return None, step
+
+    def matters(self, steps: Sequence[Step]) -> Callable[[Verdict], bool]:
+        """Whether something is significant, and more than what the steps so far leave of rounding.
+
+        Steps of the encoders, of the integration, and what a smooth sign makes of a sharp one show
+        as a thousandth of the effects themselves, which with large effects is no small matter.
+        """
+        noise = steps[-1].diagnosis.noise
+        gone = _whitened_error(steps[0].fit.residuals, noise)
+        gone -= _whitened_error(steps[-1].fit.residuals, noise)
+        return lambda v: v.p_value < self.significance and v.explained > 1e-3 * gone
+
+    def convinces(self, contenders: Sequence[Contender], last: Step) -> bool:
+        """Whether the best contender betters the model, and by as much as a free-form curve."""
+        if not contenders:
+            return False
+        gained = self.criterion(last.fit, last.diagnosis.noise) - contenders[0].criterion
+        return gained > 0 and not _curve_is_better(last.diagnosis, gained)
 
     def refit(
         self, last: Step, leading: Sequence[Verdict], say: Callable[[str], None]
@@ -417,8 +432,8 @@ class _Search(eqx.Module):
                 value = self.criterion(refitted, last.diagnosis.noise)
                 if np.isfinite(value):
                     tried.append(Contender(*verdict.key, refitted, value))
-            found += sorted(tried, key=lambda c: c.criterion)[:1]
-        return sorted(found, key=lambda c: c.criterion)
+            found += sorted(tried, key=_criterion)[:1]
+        return sorted(found, key=_criterion)
 
     def settled(self, best: Contender, say: Callable[[str], None]) -> Contender:
         """The best contender with noise filters of its own, and its held shapes if they matter.
@@ -507,12 +522,28 @@ def _quiet(method: OEM) -> OEM:
     return dataclasses.replace(method, progress=False)
 
 
+def _criterion(contender: Contender) -> float:
+    return contender.criterion
+
+
+def _transmissions(diagnosis: Diagnosis) -> list[Verdict]:
+    """Elasticity and backlash on the joint on which a free-form curve explains most."""
+    joint = diagnosis.where[0].hypothesis.joint
+    return [
+        v
+        for v in diagnosis.ranking
+        if isinstance(v.hypothesis.effect, AbstractTransmission) and v.hypothesis.joint == joint
+    ]
+
+
 def _leading(entries: Sequence[Verdict]) -> list[Verdict]:
     """The entries whose evidence is close to the best's, three at the most.
 
     Signatures are exact to first order only: five per cent of the best is within what the
     nonlinear models may still turn round.
     """
+    if not entries:
+        return []
     best = entries[0].evidence
     close = [v for v in entries if v.evidence > best - max(30.0, 0.05 * best)]
     return close[:3]

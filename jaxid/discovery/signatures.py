@@ -67,7 +67,7 @@ def survey(
         q.max(axis=0),
         np.abs(np.asarray(motion.v)).reshape(-1, loop.joints).max(axis=0),
         np.abs(np.asarray(motion.tau)).reshape(-1, loop.joints).max(axis=0),
-        np.einsum("kjj->j", mass) / len(mass),
+        1 / np.mean(np.diagonal(np.linalg.inv(mass), axis1=1, axis2=2), axis=0),
         np.array([sharp.get(j, 100.0) for j in range(1, loop.joints + 1)]),
         float(np.median([r.period for r in recordings])),
         float(max(r.duration for r in recordings)),

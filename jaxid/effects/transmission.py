@@ -31,14 +31,14 @@ class JointElasticity(AbstractTransmission):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["JointElasticity"]:
-        """Resonances against the link at a twentieth and a tenth of the sample rate."""
-        made = []
-        for j in scene.joints:
-            inertia = scene.inertia[j - 1]
-            for share in (0.05, 0.1):
-                rate = 2 * np.pi * share / scene.period
-                made.append(cls(joint=j, compliance=1 / (inertia * rate**2), rotor=0.3 * inertia))
-        return made
+        """Resonances against the link from 3 Hz to a tenth of the sample rate."""
+        highest = 0.1 / scene.period
+        rates = 2 * np.pi * np.geomspace(min(3.0, 0.3 * highest), highest, 4)
+        return [
+            cls(joint=j, compliance=1 / (inertia * rate**2), rotor=0.3 * inertia)
+            for j, inertia in zip(scene.joints, scene.inertia, strict=True)
+            for rate in rates
+        ]
 
     def scaled(self, factor: float) -> "JointElasticity":
         """The compliance times a factor."""
@@ -74,12 +74,12 @@ class Backlash(AbstractTransmission):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Backlash"]:
-        """Gaps up to three thousandths of the travel, contact at a quarter of the sample rate."""
+        """Gaps up to three hundredths of the travel, contact at a quarter of the sample rate."""
         made = []
         for j in scene.joints:
             inertia = scene.inertia[j - 1]
             stiffness = 0.21 * inertia * (0.25 / scene.period * 2 * np.pi) ** 2
-            for share in (0.0003, 0.001, 0.003):
+            for share in (0.0003, 0.001, 0.003, 0.01, 0.03):
                 for part in (0.22, 0.32, 0.42):
                     gap, rotor = share * scene.travel(j), part * inertia
                     made.append(cls(joint=j, gap=gap, rotor=rotor, stiffness=stiffness))
