@@ -9,7 +9,8 @@ class Scene(eqx.Module):
     """Ranges of the recorded motion, one value a joint, in SI units.
 
     - `q_low`, `q_high`: range of position. `speed`, `torque`: largest magnitudes.
-    - `inertia`: what a joint feels while the others are free, averaged. `gamma`: sharpness of the Coulomb friction.
+    - `inertia`: what a joint feels while the others are free, averaged. `gamma`: sharpness of its
+      Coulomb friction.
     - `period`, `duration`: of the recordings, s. `recordings`: their names.
     - `tones`: frequencies that stand out of the residual's spectrum, Hz.
     - `lengths`: of the links before the last, m; `g`: gravity in their plane, m/s².
