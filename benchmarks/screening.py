@@ -34,7 +34,9 @@ def recorded() -> jaxid.Recordings:
     made = []
     for name in FITTING:
         r = case.recordings[name]
-        made.append(jaxid.Recording(r["time"], r["q_ref"], r["q"], r["tau"], name=name))
+        made.append(
+            jaxid.Recording(r["time"], r["q"], r["tau"], q_ref=r["q_ref"], name=name)
+        )
     return jaxid.Recordings.of(made)
 
 

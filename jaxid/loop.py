@@ -211,20 +211,38 @@ def settle(
     return dataclasses.replace(state, effects=tuple(settled))
 
 
+def _sensor(loop: ClosedLoop, q: Float[Array, " joints"]) -> Float[Array, " joints"]:
+    """What sensors without steps report, `(joints,)`."""
+    for effect in loop.effects:
+        q = effect.read(q)
+    return q
+
+
 def read(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Reading:
     """What the sensors report at a position and velocity, `(joints,)`."""
-
-    def sensor(position: Float[Array, " joints"]) -> Float[Array, " joints"]:
-        for effect in loop.effects:
-            position = effect.read(position)
-        return position
-
-    seen, rate = jax.jvp(sensor, (q,), (v,))
+    seen, rate = jax.jvp(lambda position: _sensor(loop, position), (q,), (v,))
     if loop.resolution is not None:
         step = jnp.asarray(loop.resolution)
         # Rounding has no slope; sensitivities go through as if the encoder were ideal.
         seen = seen + jax.lax.stop_gradient(step * jnp.round(seen / step) - seen)
     return Reading(seen, rate)
+
+
+def behind(
+    loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]
+) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
+    """Position and velocity at which the sensors report these, `(joints,)` each."""
+    if all(type(effect).read is AbstractEffect.read for effect in loop.effects):
+        return q, v
+
+    def position(reading: Float[Array, " joints"]) -> Float[Array, " joints"]:
+        guess = reading
+        # Errors of sensors are some hundredths of what they read: each turn gains two digits.
+        for _ in range(6):
+            guess = guess + reading - _sensor(loop, guess)
+        return guess
+
+    return jax.jvp(position, (q,), (v,))
 
 
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:

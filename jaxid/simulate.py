@@ -14,7 +14,7 @@ from scipy import interpolate
 
 from .control import Reading, Reference
 from .errors import RecordingError
-from .loop import ClosedLoop, Instant, State, instant, rest, settle
+from .loop import ClosedLoop, Instant, State, behind, instant, rest, settle
 from .recording import Recording, Recordings
 from .smoothing import Band
 from .stepping import RK4, flow
@@ -295,10 +295,11 @@ def initial(
     q: Float[Array, " joints"],
     v: Float[Array, " joints"],
 ) -> Float[Array, " states"]:
-    """The flat state at the start of a run, at a position and velocity, `(states,)`."""
+    """The flat state at the start of a run, `(states,)`, at measured position and velocity."""
     first = jax.tree.map(lambda leaf: leaf[0], intervals)
     reference = _reference(first, jnp.zeros(()))
-    return ravel_pytree(settle(loop, first.t0, rest(loop, q, v), reference, first.label))[0]
+    start = rest(loop, *behind(loop, q, v))
+    return ravel_pytree(settle(loop, first.t0, start, reference, first.label))[0]
 
 
 Scalars = tuple[Float[Array, ""], ...]

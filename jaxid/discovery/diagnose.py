@@ -66,6 +66,7 @@ class Diagnosis(eqx.Module):
     - `ranking`: the catalogue's entries, each at its best setting, best first.
     - `forms`: the same for every form of an effect (class) on its own.
     - `where`: free-form curves of every coordinate, best first.
+    - `pair`: two entries that together explain more than the best curve, where none does alone.
     - `noise`: the noise filter of each output.
     """
 
@@ -73,6 +74,7 @@ class Diagnosis(eqx.Module):
     ranking: tuple[Verdict, ...]
     forms: tuple[Verdict, ...]
     where: tuple[Verdict, ...]
+    pair: tuple[Verdict, ...]
     noise: tuple[ARFilter, ...]
     data: Data
     gram: Gram
@@ -475,11 +477,14 @@ def _judge(
         _keep_better(ranking, verdict.key, verdict)
         _keep_better(forms, (*verdict.key, type(effect)), verdict)
     columns = columns_of(blocks, picked)
+    best = tuple(sorted(ranking.values(), key=_order, reverse=True))
+    curves = tuple(sorted(where.values(), key=_order, reverse=True))
     return Diagnosis(
         fit,
-        tuple(sorted(ranking.values(), key=_order, reverse=True)),
+        best,
         tuple(sorted(forms.values(), key=_order, reverse=True)),
-        tuple(sorted(where.values(), key=_order, reverse=True)),
+        curves,
+        _pair(gram, hypotheses, best, curves, tests),
         noise,
         data,
         gram,
@@ -489,6 +494,32 @@ def _judge(
         tests,
         significance,
     )
+
+
+def _pair(
+    gram: Gram,
+    hypotheses: list[Hypothesis],
+    ranking: tuple[Verdict, ...],
+    where: tuple[Verdict, ...],
+    tests: float,
+) -> tuple[Verdict, ...]:
+    """Two effects that only together explain what the best curve does, each leading entry tried."""
+    if not where or not ranking or where[0].evidence < ranking[0].evidence:
+        return ()
+    effects = [h for h in hypotheses if not isinstance(h.effect, Curve)]
+    best, most = (), where[0].evidence
+    for first in ranking[:8]:
+        rest = gram.without(first.hypothesis.columns)
+        explained, freedom = rest.explained([h.columns for h in effects])
+        own = [h.name == first.key[0] and h.joint == first.key[1] for h in effects]
+        evidence = np.where(own, -np.inf, explained - freedom * np.log(gram.count))
+        k = int(np.argmax(evidence))
+        if first.evidence + evidence[k] > most:
+            most = first.evidence + evidence[k]
+            value, count = gram.explained([effects[k].columns])
+            second = _verdict(gram, effects[k], float(value[0]), int(count[0]), tests)
+            best = (first, second)
+    return best
 
 
 def _keep_better(found: dict[tuple[Any, ...], Verdict], key: tuple[Any, ...], new: Verdict) -> None:

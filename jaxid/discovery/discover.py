@@ -372,18 +372,16 @@ class _Search(eqx.Module):
         diagnosis = last.diagnosis
         matters = self.matters(steps)
         entries = [v for v in diagnosis.ranking if matters(v) and v.possible and v.evidence > 0]
-        # A weak entry that no refit confirms is chance unless a curve finds something as well.
-        failing = "outside_catalogue" if any(map(matters, diagnosis.where)) else done
-        if len(steps) > most or not (entries or failing != done):
-            return failing, None
+        outside = any(map(matters, diagnosis.where))
+        if len(steps) > most or not (entries or outside):
+            return "outside_catalogue" if outside else done, None
         contenders = self.refit(last, _with_forms(_leading(entries), diagnosis.forms), say)
-        if failing != done and not self.convinces(contenders, last):
-            # A drive and a link that come apart are far from what a small setting shows of them.
-            tried = {(c.name, c.joint) for c in contenders}
-            others = [v for v in _transmissions(diagnosis) if v.key not in tried]
-            contenders = sorted(contenders + self.refit(last, others, say), key=_criterion)
+        if outside and not self.convinces(contenders, last):
+            contenders = self.second_thoughts(contenders, last, say)
         if not self.convinces(contenders, last):
-            return failing, None
+            # A weak entry that no refit confirms is chance, unless a curve finds something as well.
+            outside = outside and self.confirmed(last, say)
+            return "outside_catalogue" if outside else done, None
         best = contenders[0]
         contenders[0] = best = self.settled(best, say)
         say(f"diagnosis with {_name(best.name, best.joint)}")
@@ -408,11 +406,48 @@ class _Search(eqx.Module):
         return lambda v: v.p_value < self.significance and v.explained > 1e-3 * gone
 
     def convinces(self, contenders: Sequence[Contender], last: Step) -> bool:
-        """Whether the best contender betters the model, and by as much as a free-form curve."""
+        """Whether the best contender betters the model, and leaves no curve that does much better.
+
+        Where two effects together explain more than any curve, one of them may do with less.
+        """
         if not contenders:
             return False
         gained = self.criterion(last.fit, last.diagnosis.noise) - contenders[0].criterion
-        return gained > 0 and not _curve_is_better(last.diagnosis, gained)
+        if gained <= 0:
+            return False
+        pair = {v.key for v in last.diagnosis.pair}
+        best = (contenders[0].name, contenders[0].joint)
+        return best in pair or not _curve_is_better(last.diagnosis, gained)
+
+    def second_thoughts(
+        self, contenders: Sequence[Contender], last: Step, say: Callable[[str], None]
+    ) -> list[Contender]:
+        """More contenders, before anything is called outside the catalogue.
+
+        Two effects that only together explain it; and elasticity and backlash, since a drive and a
+        link that come apart are far from what a small setting shows of them.
+        """
+        tried = {(c.name, c.joint) for c in contenders}
+        others = {v.key: v for v in (*last.diagnosis.pair, *_transmissions(last.diagnosis))}
+        more = self.refit(last, [v for key, v in others.items() if key not in tried], say)
+        return sorted([*contenders, *more], key=_criterion)
+
+    def confirmed(self, last: Step, say: Callable[[str], None]) -> bool:
+        """Whether the curve that explains most is more than chance.
+
+        Little evidence needs a second witness: recordings that the curve was not fitted to.
+        """
+        top = last.diagnosis.where[0]
+        if top.evidence > 0:
+            return True
+        if self.held_out is None:
+            return top.p_value < 0.1 * self.significance
+        say(f"refit with a curve on joint {top.hypothesis.joint}")
+        grown = last.fit.loop.add(last.diagnosis.predicted(top))
+        found = fit(grown, self.recordings, self.whitened_method(last.diagnosis))
+        return self.unseen_error(found, last.diagnosis.noise) < self.unseen_error(
+            last.fit, last.diagnosis.noise
+        )
 
     def refit(
         self, last: Step, leading: Sequence[Verdict], say: Callable[[str], None]
@@ -467,14 +502,18 @@ class _Search(eqx.Module):
 
         Less is better; a difference of ten is decisive.
         """
-        total = _whitened_error(found.residuals, noise)
+        total = _whitened_error(found.residuals, noise) + self.unseen_error(found, noise)
         count = sum(r.size for r in found.residuals)
-        if self.held_out is not None:
-            try:
-                total += _whitened_error(_held_residuals(found, self.held_out), noise)
-            except (ArithmeticError, ValueError, RuntimeError):
-                return np.inf
         return total + len(found.names) * float(np.log(count))
+
+    def unseen_error(self, found: Fit, noise: Sequence[ARFilter]) -> float:
+        """Whitened squared error on held-out recordings; infinite where the loop runs away."""
+        if self.held_out is None:
+            return 0.0
+        try:
+            return _whitened_error(_held_residuals(found, self.held_out), noise)
+        except (ArithmeticError, ValueError, RuntimeError):
+            return np.inf
 
     def prune(
         self, steps: list[Step], say: Callable[[str], None]

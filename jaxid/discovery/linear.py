@@ -124,7 +124,7 @@ def respond(
         # Written out, the four products fuse into one loop over the columns.
         return jnp.sum(matrix[:, :, None] * columns[None], axis=1)
 
-    def one(a, b, c, d, values):
+    def one(a, b, c, d, start, values):
         def body(carry, step):
             s, now = carry
             a, b, c, d, then = step
@@ -134,8 +134,11 @@ def respond(
         # Beyond the last point the line goes on, so that its slope, a velocity, stays what it is.
         beyond = 2 * values[-1:] - values[-2:-1]
         after = jnp.concatenate([values[1:], beyond])
-        zero = jnp.zeros((a.shape[-1], values.shape[-1]), values.dtype)
+        s = jnp.zeros((a.shape[-1], values.shape[-1]), values.dtype)
+        if place == "noise":
+            # A run starts where the sensors said that it does.
+            s = -times(start[:, :joints].astype(values.dtype), values[0])
         matrices = (x.astype(values.dtype) for x in (a, b[..., inputs], c, d[..., inputs]))
-        return jax.lax.scan(body, (zero, values[0]), (*matrices, after))[1]
+        return jax.lax.scan(body, (s, values[0]), (*matrices, after))[1]
 
-    return jax.vmap(one)(linear.A, linear.B, linear.C, linear.D, values)
+    return jax.vmap(one)(linear.A, linear.B, linear.C, linear.D, linear.start, values)
