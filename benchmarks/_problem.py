@@ -39,7 +39,7 @@ def truth() -> jaxid.ClosedLoop:
 
 
 def recordings(count: int, seconds: float, seed: int = 0) -> jaxid.Recordings:
-    """Simulated recordings of different multi-sines that start at rest, with noise in the torque."""
+    """Simulated recordings of multi-sines that start at rest, with noise in the torque."""
     rng = np.random.default_rng(seed)
     time_ = PERIOD * np.arange(round(seconds / PERIOD) + 1)
     fade = np.clip(time_ / 1.5, 0, 1)[:, None]
@@ -50,9 +50,7 @@ def recordings(count: int, seconds: float, seed: int = 0) -> jaxid.Recordings:
         size = np.array([0.5, 0.9]) / 5**0.5
         q_ref = fade * np.sum(size * np.sin(time_[:, None, None] * rate + phase), axis=1)
         # Only its reference and its start are used: what stands for the torque is overwritten.
-        bare.append(
-            jaxid.Recording.from_arrays(time_, q_ref, q_ref, q_ref=q_ref, name=f"r{k}")
-        )
+        bare.append(jaxid.Recording.from_arrays(time_, q_ref, q_ref, q_ref=q_ref, name=f"r{k}"))
     runs = simulate(truth(), jaxid.Recordings.of(bare))
     return jaxid.Recordings.of(
         [
@@ -69,7 +67,7 @@ def recordings(count: int, seconds: float, seed: int = 0) -> jaxid.Recordings:
 
 
 def arrays(recs: jaxid.Recordings) -> list[dict[str, np.ndarray]]:
-    """What peers need of each recording: interval lengths, cubics of the reference, start, torque."""
+    """What peers need of each recording: lengths of intervals, cubics, start, torque."""
     batch = prepare(cad(), recs)
     return [
         {

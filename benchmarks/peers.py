@@ -18,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -29,7 +29,7 @@ from jaxid.estimate._least_squares import sensitivity
 from jaxid.simulate import each, initial, prepare, run
 
 from ._output import options, report
-from ._problem import SUBSTEPS, TRUTH, arrays, cad, interleaved, machine, once, recordings
+from ._problem import NOISE, SUBSTEPS, TRUTH, arrays, cad, interleaved, machine, once, recordings
 
 KP, KV, KG = np.array([6.25, 156.25]), np.array([2.0, 25.0]), np.array([3.5, 0.06])
 GAMMA, LENGTH, P = 100.0, 0.5, 8
@@ -54,20 +54,20 @@ def of_jaxid(recs: jaxid.Recordings) -> Peer:
     loop = cad()
     batch = prepare(loop, recs)
     white = jnp.zeros((2, 16)).at[:, 0].set(1.0)
+    ones = jnp.ones(2)
 
-    @eqx.filter_jit
-    def torque(loop):
+    @jax.jit
+    def simulate(theta):
+        changed = loop.with_theta(theta)
+
         def one(intervals, q0, v0):
-            return run(loop, intervals, initial(loop, intervals, q0, v0))[1][:, 0]
+            return run(changed, intervals, initial(changed, intervals, q0, v0))[1][:, 0]
 
         return each(one, batch.intervals, batch.q0, batch.v0)
 
-    def simulate(theta):
-        return torque(loop.with_theta(jnp.asarray(theta)))
-
+    @jax.jit
     def jacobian(theta):
-        changed = loop.with_theta(jnp.asarray(theta))
-        found = sensitivity(changed, batch, jnp.ones(2), white, ("tau",), False)
+        found = sensitivity(loop.with_theta(theta), batch, ones, white, ("tau",), False)
         return batch.tau - found.raw, -found.jacobian
 
     once(lambda: jacobian(np.asarray(loop.theta)))
@@ -109,7 +109,7 @@ def of_c(recs: jaxid.Recordings) -> Peer | None:
 
 
 def physics(np_, p, c, t, x):
-    """Torque and rate of the loop, in the functions of `np_`: for peers that trace or call Python."""
+    """Torque and rate of the loop, in the functions of `np_`, for peers that call Python."""
     reference = [c[j] + t * (c[2 + j] + t * (c[4 + j] + t * c[6 + j])) for j in range(2)]
     tau = [KG[j] * (KP[j] * (reference[j] - x[j]) - KV[j] * x[2 + j]) for j in range(2)]
     v1, v2, cs, sn = x[2], x[3], np_.cos(x[1]), np_.sin(x[1])
@@ -146,7 +146,9 @@ def of_casadi(recs: jaxid.Recordings, compiled: bool) -> Peer | None:
     moved = ca.jacobian(after, x) @ s + ca.jacobian(after, p)
     shown = ca.jacobian(tau, x) @ s
     plain = ca.Function("plain", [x, c, t, h, p], [after, tau])
-    both = ca.Function("both", [ca.horzcat(x, s), c, t, h, p], [ca.horzcat(after, moved), tau, shown])
+    both = ca.Function(
+        "both", [ca.horzcat(x, s), c, t, h, p], [ca.horzcat(after, moved), tau, shown]
+    )
     if compiled:
         folder = Path(tempfile.mkdtemp())
         generator = ca.CodeGenerator("steps.c")
@@ -310,16 +312,15 @@ def of_mujoco(recs: jaxid.Recordings) -> Peer | None:
 def fitted(peer: Peer, recs: jaxid.Recordings) -> tuple[np.ndarray, float]:
     """SciPy's least squares with a peer's Jacobian, from the CAD start: estimate and seconds."""
     measured = np.stack([d["tau"] for d in arrays(recs)])
-    size = measured.std(axis=(0, 1))
     start = np.maximum(np.asarray(cad().theta), 1e-9)
     low = np.where([name in ("MX2", "MY2") for name in TRUTH], -np.inf, 0.0)
     started = time.perf_counter()
     solved = optimize.least_squares(
         lambda theta: np.nan_to_num(
-            ((np.asarray(peer.simulate(theta)) - measured) / size).ravel(), nan=1e6
+            ((np.asarray(peer.simulate(theta)) - measured) / NOISE).ravel(), nan=1e6
         ),
         start,
-        jac=lambda theta: (np.asarray(peer.jacobian(theta)[1]) / size[:, None]).reshape(-1, P),
+        jac=lambda theta: (np.asarray(peer.jacobian(theta)[1]) / NOISE).reshape(-1, P),
         x_scale="jac",
         bounds=(low, np.inf),
         max_nfev=60,

@@ -29,9 +29,7 @@ def everywhere(tree: PyTree, mesh: Mesh) -> PyTree:
     return jax.tree.map(placed, tree)
 
 
-def shared_out(
-    fun: Callable[..., Result], mesh: Mesh, same: PyTree, each: PyTree
-) -> Result:
+def shared_out(fun: Callable[..., Result], mesh: Mesh, same: PyTree, each: PyTree) -> Result:
     """`fun(same, each)` with the leading axis of `each` split over a mesh; called inside a jit.
 
     What does not divide evenly is filled up with copies of the last entry, and their results
@@ -57,6 +55,4 @@ def shared_out(
     )
     result = part(arrays, jax.tree.map(fill, each))
     whole = NamedSharding(mesh, PartitionSpec())
-    return jax.tree.map(
-        lambda leaf: jax.lax.with_sharding_constraint(leaf, whole)[:count], result
-    )
+    return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, whole)[:count], result)

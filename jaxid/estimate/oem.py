@@ -72,7 +72,8 @@ class OEM(AbstractMethod):
         changed = [
             f"{field.name}={value!r}"
             for field in dataclasses.fields(self)
-            if field.name not in ("progress", "mesh") and (value := getattr(self, field.name)) != field.default
+            if field.name not in ("progress", "mesh")
+            and (value := getattr(self, field.name)) != field.default
         ]
         return f"OEM({', '.join(changed)})"
 
