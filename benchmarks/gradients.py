@@ -84,9 +84,10 @@ def ways(recs: jaxid.Recordings, loop: jaxid.ClosedLoop) -> tuple[dict[str, Way]
 
         return jnp.sum((batch.tau - each(one, *starts)) ** 2)
 
+    # The adjoint differentiates by all that is handed to it, so the reference stays outside.
+    first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], starts)
+
     def backsolve(theta):
-        # The adjoint differentiates by all that is handed to it, so the reference stays outside.
-        first = jax.tree.map(lambda leaf: leaf[0], starts)
         return jnp.sum((batch.tau[0] - _backsolved(loop, theta, *first)) ** 2)
 
     jacobians = {
@@ -146,7 +147,7 @@ def _backsolved(loop, theta, intervals: Interval, q, v):
 
     def at(t):
         k = jnp.clip(((t - times[0]) / PERIOD).astype(int), 0, len(times) - 1)
-        return jax.tree.map(lambda leaf: leaf[k], intervals)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[k], intervals)
 
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, x, theta: _rate(loop, theta, at(t), t, x)[0]),
