@@ -35,7 +35,8 @@ def test_peers_simulate_and_differentiate_the_same_loop(tmp_path):
 def test_ways_to_a_gradient_agree_as_far_as_each_can(tmp_path):
     rows = {row["way"]: row for row in _quick("gradients", tmp_path) if row.get("error")}
     steps = rows["forward mode through the steps"]["error"]
-    assert steps < 1e-4
+    # Four steps in 10 ms, with a sign as sharp as 100 s/rad.
+    assert steps < 2e-3
     # The same numbers by another road: what differs is rounding.
     assert abs(rows["sensitivity equations, augmented"]["error"] - steps) < 1e-8
     assert rows["reverse mode, checkpoints"]["error"] < 1e-3
