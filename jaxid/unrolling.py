@@ -61,7 +61,8 @@ class _Value:
 
     def __init__(self, shape, dtype, array=None, scalars=None):
         self.shape, self.dtype = tuple(shape), dtype
-        self._array, self._scalars = array, scalars
+        self._array: Any = array
+        self._scalars: Any = scalars
 
     @classmethod
     def of(cls, array) -> "_Value":
@@ -173,10 +174,10 @@ class _Writer:
         return None
 
     def elementwise(self, eqn, arrays: list[np.ndarray]) -> np.ndarray:
-        arrays = np.broadcast_arrays(*arrays)
-        out = np.empty(arrays[0].shape, object)
+        spread = np.broadcast_arrays(*arrays)
+        out = np.empty(spread[0].shape, object)
         for at in np.ndindex(out.shape):
-            out[at] = self.scalar(eqn.primitive, eqn.params, [a[at] for a in arrays])
+            out[at] = self.scalar(eqn.primitive, eqn.params, [a[at] for a in spread])
         return out
 
     def scalar(self, primitive, params, args: list[Any]):
