@@ -417,7 +417,9 @@ def _keep_programs() -> None:
         return
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     jax.config.update("jax_compilation_cache_dir", str(Path(base) / "jaxid"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    # The small ones too: a fit has dozens, and each takes longer to compile than to read.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 # What an interrupt says beside that it was one; a command in progress sets it.

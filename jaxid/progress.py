@@ -3,8 +3,6 @@
 import contextlib
 from collections.abc import Callable, Iterator
 
-from rich.console import Console
-
 
 @contextlib.contextmanager
 def working(title: str, show: bool = True) -> Iterator[Callable[[str], None]]:
@@ -15,8 +13,14 @@ def working(title: str, show: bool = True) -> Iterator[Callable[[str], None]]:
     - `title`: before every text.
     - `show`: False to stay silent everywhere.
     """
+    if not show:
+        yield lambda text: None
+        return
+    # Here, since most of a command's short life goes into imports.
+    from rich.console import Console
+
     console = Console(stderr=True)
-    if not (show and console.is_terminal):
+    if not console.is_terminal:
         yield lambda text: None
         return
     with console.status(title) as status:

@@ -8,9 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
-from scipy import interpolate
 
 from .control import Reading, Reference
 from .errors import RecordingError
@@ -95,12 +95,12 @@ def _pieces(
     """Taylor coefficients of an interpolant at the grid points, `(points, order + 1, joints)`."""
     beyond = np.append(time, time[-1] + 1.0)
     if kind == "cubic" and order == 3:
-        spline = interpolate.CubicSpline(time, values)
+        spline = scipy.interpolate.CubicSpline(time, values)
     else:
         slope = np.zeros_like(values)
         if kind != "hold":
             slope[:-1] = np.diff(values, axis=0) / np.diff(time)[:, None]
-        spline = interpolate.PPoly(np.stack([slope, values]), beyond)
+        spline = scipy.interpolate.PPoly(np.stack([slope, values]), beyond)
     factorial = (1.0, 1.0, 2.0, 6.0)
     return np.stack([spline(at, nu) / factorial[nu] for nu in range(order + 1)], axis=1)
 
@@ -200,8 +200,10 @@ def prepare(
     rows = [
         _drive(loop, r, g, length, e) for r, g, e in zip(recordings, grids, noises, strict=True)
     ]
-    fields = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *rows)
-    intervals = jax.vmap(jax.vmap(Interval))(*fields)
+    fields = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *rows))
+    # Shapes alone are mapped: the values are where they belong already.
+    shapes = jax.eval_shape(jax.vmap(jax.vmap(Interval)), *fields)
+    intervals = jax.tree.unflatten(jax.tree.structure(shapes), jax.tree.leaves(fields))
     on_grid = all(len(grid) == r.samples for r, (grid, _) in zip(recordings, grids, strict=True))
     starts = [(r.q[0], np.zeros(loop.joints)) if at_rest(r) else start_of(r) for r in recordings]
     band = band_of(loop, recordings)
@@ -211,16 +213,16 @@ def prepare(
     def stack(pick) -> Array:
         pieces = [pick(k, r) for k, r in enumerate(recordings)]
         pads = [np.repeat(p[-1:], samples - len(p), axis=0) for p in pieces]
-        return jnp.asarray(
+        return jax.device_put(
             np.stack([np.concatenate(both) for both in zip(pieces, pads, strict=True)])
         )
 
     return Batch(
         intervals,
         None if on_grid else stack(lambda k, r: np.searchsorted(grids[k][0], r.time)),
-        jnp.arange(samples)[None] < jnp.asarray([r.samples for r in recordings])[:, None],
-        jnp.asarray(np.stack([q for q, _ in starts])),
-        jnp.asarray(np.stack([v for _, v in starts])),
+        jax.device_put(np.arange(samples) < np.array([[r.samples] for r in recordings])),
+        jax.device_put(np.stack([q for q, _ in starts])),
+        jax.device_put(np.stack([v for _, v in starts])),
         stack(lambda k, r: r.time),
         stack(lambda k, r: r.q),
         stack(lambda k, r: r.tau),
@@ -322,7 +324,11 @@ def advance(
 
 
 def _advance(
-    loop: ClosedLoop, interval: Interval, y: Scalars, rows: tuple[int, ...]
+    loop: ClosedLoop,
+    interval: Interval,
+    y: Scalars,
+    rows: tuple[int, ...],
+    substeps: Int[Array, ""] | None = None,
 ) -> tuple[Scalars, Scalars, Float[Array, "rows joints"]]:
     """The states at an interval's end and start, and signals at its start, state by state."""
     unravel = unflatten(loop)
@@ -346,7 +352,8 @@ def _advance(
     held, seen = unrolled(begin, interval, y)(interval, y)
     written = unrolled(rate, interval.t0, y)
     if isinstance(loop.stepping.solver, RK4) and loop.stepping.control is None:
-        after = flow(loop.stepping, lambda t, y, _: written(t, y), interval.t0, interval.h, held)
+        plain = lambda t, y, _: written(t, y)  # noqa: E731
+        after = flow(loop.stepping, plain, interval.t0, interval.h, held, substeps)
         return after, y, seen
     # Implicit methods and step control think of the state as one vector.
     after = flow(
@@ -355,6 +362,7 @@ def _advance(
         interval.t0,
         interval.h,
         jnp.stack(held),
+        substeps,
     )
     return tuple(after), y, seen
 
@@ -365,12 +373,18 @@ SIGNALS = ("tau", "q", "v", "a", "delivered")
 
 
 def run(
-    loop: ClosedLoop, intervals: Interval, x0: Float[Array, " states"]
+    loop: ClosedLoop,
+    intervals: Interval,
+    x0: Float[Array, " states"],
+    substeps: Int[Array, ""] | None = None,
 ) -> tuple[Float[Array, "points states"], Float[Array, "points 5 joints"]]:
-    """One run from a flat initial state: states and signals at every grid point."""
+    """One run from a flat initial state: states and signals at every grid point.
+
+    `substeps` is for programs that serve any number of them; None for the loop's own.
+    """
 
     def body(y, interval):
-        after, before, seen = _advance(loop, interval, y, tuple(range(5)))
+        after, before, seen = _advance(loop, interval, y, tuple(range(5)), substeps)
         return after, (jnp.stack(before), seen)
 
     return jax.lax.scan(body, tuple(x0), intervals)[1]
@@ -427,9 +441,9 @@ def each(fun: Callable, *args):
 
 
 @eqx.filter_jit
-def _simulate(loop: ClosedLoop, batch: Batch) -> Simulated:
+def _simulate(loop: ClosedLoop, batch: Batch, substeps: Int[Array, ""] | None) -> Simulated:
     def one(intervals, at, q0, v0, time):
-        states, seen = run(loop, intervals, initial(loop, intervals, q0, v0))
+        states, seen = run(loop, intervals, initial(loop, intervals, q0, v0), substeps)
         if at is not None:
             states, seen = states[at], seen[at]
         tau, q, v, a, delivered = jnp.moveaxis(seen, 1, 0)
@@ -459,9 +473,14 @@ def simulate(
     """
     recordings = Recordings.of(recordings)
     loop = with_substeps(loop, recordings)
-    together = _simulate(loop, prepare(loop, recordings, noise))
+    batch, substeps = prepare(loop, recordings, noise), None
+    if loop.stepping.control is None:
+        # One program for any number of steps: refining them need not compile again.
+        substeps = jnp.asarray(loop.stepping.substeps or 1)
+        loop = set_substeps(loop, None)
+    together = jax.device_get(_simulate(loop, batch, substeps))
     return tuple(
-        jax.tree.map(lambda leaf, k=k, r=r: np.asarray(leaf[k, : r.samples]), together)
+        jax.tree.map(lambda leaf, k=k, r=r: leaf[k, : r.samples], together)
         for k, r in enumerate(recordings)
     )
 
@@ -485,7 +504,7 @@ def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     return set_substeps(loop, int(np.clip(substeps, 1, 64)))
 
 
-def set_substeps(loop: ClosedLoop, substeps: int) -> ClosedLoop:
+def set_substeps(loop: ClosedLoop, substeps: int | None) -> ClosedLoop:
     """The loop with that many steps between two grid points."""
     stepping = dataclasses.replace(loop.stepping, substeps=substeps)
     return dataclasses.replace(loop, stepping=stepping)

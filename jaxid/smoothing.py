@@ -5,8 +5,8 @@ import itertools
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Bool, Float
-from scipy import interpolate, signal
 
 from .errors import RecordingError
 from .recording import Recording
@@ -24,12 +24,12 @@ def low_pass(
     - `x`: `(samples, columns)`.
     - `rate`: samples in a second, Hz. `cutoff`: of the filter, Hz.
     """
-    sections = signal.butter(order, cutoff, fs=rate, output="sos")
+    sections = scipy.signal.butter(order, cutoff, fs=rate, output="sos")
     # SciPy's own choice of padding is shorter than the filter remembers, and then a signal that
     # moves at its end is bent there. A straight line would pass unchanged, so it need not pass.
     pad = min(len(x) - 1, int(np.ceil(4 * rate / cutoff)))
     line = np.linspace(x[0], x[-1], len(x))
-    return line + signal.sosfiltfilt(sections, x - line, axis=0, padlen=pad)
+    return line + scipy.signal.sosfiltfilt(sections, x - line, axis=0, padlen=pad)
 
 
 def even_times(recording: Recording) -> Float[np.ndarray, " samples"]:
@@ -45,7 +45,7 @@ def resampled(
     """Samples at other times, by a cubic spline where the two differ."""
     if np.allclose(time, at, rtol=0, atol=1e-6 * (time[1] - time[0])):
         return x
-    return interpolate.CubicSpline(time, x)(at)
+    return scipy.interpolate.CubicSpline(time, x)(at)
 
 
 def smooth_motion(
@@ -67,12 +67,10 @@ def signal_cutoff(recording: Recording) -> float:
     n, rate = recording.samples, recording.rate
     if n < 200:
         return rate / 10
-    q = signal.detrend(resampled(recording.time, recording.q, even_times(recording)), axis=0)
+    q = scipy.signal.detrend(resampled(recording.time, recording.q, even_times(recording)), axis=0)
     # A window whose side lobes stay below the noise, for the motion is 10¹⁰ times as strong.
-    power = (
-        np.abs(np.fft.rfft(q * np.asarray(signal.get_window("blackmanharris", n))[:, None], axis=0))
-        ** 2
-    )
+    window = np.asarray(scipy.signal.get_window("blackmanharris", n))[:, None]
+    power = np.abs(np.fft.rfft(q * window, axis=0)) ** 2
     f = np.fft.rfftfreq(n, 1 / rate)
     rates = power * f[:, None] ** 2
     speed = rates.sum(axis=0)
@@ -114,9 +112,9 @@ class Band(eqx.Module):
         memory = max(r.rate / c for r, c in zip(recordings, cutoffs, strict=True))
         size = 1 << int(np.ceil(np.log2(samples + 4 * memory)))
         for k, (r, cutoff) in enumerate(zip(recordings, cutoffs, strict=True)):
-            sections = signal.butter(ORDER, cutoff, fs=r.rate, output="sos")
+            sections = scipy.signal.butter(ORDER, cutoff, fs=r.rate, output="sos")
             grid = np.fft.rfftfreq(size, 1 / r.rate)
-            rows.append(np.abs(signal.sosfreqz(sections, grid, fs=r.rate)[1]) ** 2)
+            rows.append(np.abs(scipy.signal.sosfreqz(sections, grid, fs=r.rate)[1]) ** 2)
             trim = int(np.ceil(2 * r.rate / cutoff))
             kept[k, trim : r.samples - trim] = True
             if r.samples - 2 * trim < 10:

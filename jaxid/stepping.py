@@ -6,7 +6,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 
 class RK4(diffrax.AbstractSolver):
@@ -73,15 +73,18 @@ def flow(
     t0: Float[Array, ""],
     h: Float[Array, ""],
     x: PyTree[Float[Array, "..."]],
+    substeps: Int[Array, ""] | None = None,
 ) -> PyTree[Float[Array, "..."]]:
     """The state after an interval of `h` seconds; `field(t, x, args)` gives its rate.
 
-    A padded interval has no length and leaves the state as it is.
+    A padded interval has no length and leaves the state as it is. `substeps` takes the place of
+    the settings' own, for programs that serve any number; they have no reverse mode.
     """
     terms = diffrax.ODETerm(field)
     if stepping.control is not None:
         return _adaptive(stepping, terms, t0, h, x)
-    substeps = stepping.substeps or 1
+    known = substeps is None
+    substeps = (stepping.substeps or 1) if substeps is None else substeps
     solver, dt = stepping.solver, h / substeps
     memory = solver.init(terms, t0, t0 + dt, x, None)
 
@@ -91,7 +94,9 @@ def flow(
         y, _, _, memory, _ = solver.step(terms, start, start + dt, y, None, memory, False)
         return (y, memory), None
 
-    if substeps == 1:
+    if not known:
+        return jax.lax.fori_loop(0, substeps, lambda k, c: substep(c, k)[0], (x, memory))[0]
+    if stepping.substeps in (None, 1):
         return substep((x, memory), 0)[0][0]
     (x, _), _ = jax.lax.scan(substep, (x, memory), jnp.arange(substeps))
     return x

@@ -15,12 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-# Arrays above this size are left whole: writing a spline's fifty knots out would only make
+# Arrays above this size are left whole: writing a spline's dozen knots out would only make
 # programs long.
-WHOLE = 32
+WHOLE = 9
 
 ELEMENTWISE = frozenset(
-    ["abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil", "clamp", "convert_element_type", "copy", "copy_p", "cos", "cosh", "div", "eq", "erf", "erf_inv", "erfc", "exp", "exp2", "expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lgamma", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "nextafter", "not", "or", "pow", "rem", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor"]
+    """
+    abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type
+    copy copy_p cos cosh div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le
+    lgamma log log1p logistic lt max min mul ne neg nextafter not or pow rem round rsqrt select_n
+    sign sin sinh sqrt square stop_gradient sub tan tanh xor
+    """.split()  # noqa: SIM905
 )
 INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
 
@@ -56,7 +61,8 @@ class _Value:
 
     def __init__(self, shape, dtype, array=None, scalars=None):
         self.shape, self.dtype = tuple(shape), dtype
-        self._array, self._scalars = array, scalars
+        self._array: Any = array
+        self._scalars: Any = scalars
 
     @classmethod
     def of(cls, array) -> "_Value":
@@ -82,9 +88,17 @@ class _Value:
                 self._scalars[at] = self._array[at]
         return self._scalars
 
+    @classmethod
+    def like(cls, aval) -> "_Value":
+        return cls(aval.shape, aval.dtype)
+
     @property
     def small(self) -> bool:
         return math.prod(self.shape) <= WHOLE
+
+    @property
+    def written_out(self) -> bool:
+        return self.small or self._scalars is not None
 
 
 def _known(x) -> bool:
@@ -115,7 +129,8 @@ class _Writer:
 
         def look_up(atom) -> _Value:
             if isinstance(atom, Literal):
-                return _Value(atom.aval.shape, atom.aval.dtype, np.asarray(atom.val, atom.aval.dtype))
+                dtype = atom.aval.dtype
+                return _Value(atom.aval.shape, dtype, np.asarray(atom.val, dtype))
             return values[atom]
 
         values.update(zip(jaxpr.constvars, consts, strict=True))
@@ -132,7 +147,8 @@ class _Writer:
             if isinstance(inner, ClosedJaxpr):
                 return self.run(inner.jaxpr, [_Value.of(c) for c in inner.consts], inputs)
         shapes = [v.aval for v in eqn.outvars]
-        if all(math.prod(s.shape) <= WHOLE for s in shapes) and all(v.small for v in inputs):
+        moved = name in MOVES and all(v.written_out for v in inputs)
+        if moved or all(v.small for v in [*inputs, *map(_Value.like, shapes)]):
             written = self.written(eqn, name, inputs)
             if written is not None:
                 pieces = [written] if not eqn.primitive.multiple_results else written
@@ -158,10 +174,10 @@ class _Writer:
         return None
 
     def elementwise(self, eqn, arrays: list[np.ndarray]) -> np.ndarray:
-        arrays = np.broadcast_arrays(*arrays)
-        out = np.empty(arrays[0].shape, object)
+        spread = np.broadcast_arrays(*arrays)
+        out = np.empty(spread[0].shape, object)
         for at in np.ndindex(out.shape):
-            out[at] = self.scalar(eqn.primitive, eqn.params, [a[at] for a in arrays])
+            out[at] = self.scalar(eqn.primitive, eqn.params, [a[at] for a in spread])
         return out
 
     def scalar(self, primitive, params, args: list[Any]):

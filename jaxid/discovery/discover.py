@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
+import scipy
 from jaxtyping import Float
-from scipy import stats
 
 from .. import figures
 from ..archive import classes_of
@@ -696,7 +696,7 @@ def _need(last: Step, which: int, added: Sequence[int]) -> float:
     block = covariance[np.ix_(linear, linear)]
     values = last.fit.theta[linear]
     statistic = float(values @ np.linalg.pinv(block, rcond=1e-12) @ values)
-    return float(stats.chi2.sf(statistic, len(linear)))
+    return float(scipy.stats.chi2.sf(statistic, len(linear)))
 
 
 def _is_amplitude(loop: ClosedLoop, place: int) -> bool:

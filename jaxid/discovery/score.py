@@ -4,10 +4,8 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
-from scipy import stats
-from scipy.linalg import toeplitz
-from scipy.linalg.blas import ssyrk  # type: ignore[attr-defined]
 
 from ..noise import ARFilter
 
@@ -62,7 +60,7 @@ def _through(
     """
     reach = len(taps) - 1
     row = np.concatenate([taps[::-1], np.zeros(size - 1, taps.dtype)])
-    band = toeplitz(np.concatenate([taps[-1:], np.zeros(size - 1, taps.dtype)]), row)
+    band = scipy.linalg.toeplitz(np.concatenate([taps[-1:], np.zeros(size - 1, taps.dtype)]), row)
     out = np.empty_like(x)
     for at in range(0, len(x), size):
         first = max(at - reach, 0)
@@ -127,7 +125,7 @@ class Gram(eqx.Module):
         white = Whitened.of(data, noise)
         x = white.signatures
         # BLAS counts by columns: what it calls upper is our lower half.
-        half = ssyrk(1.0, x.T).astype(float)
+        half = scipy.linalg.blas.ssyrk(1.0, x.T).astype(float)
         gram = np.triu(half) + np.triu(half, 1).T
         rest = float(white.residual @ white.residual)
         return cls(gram, white.score(), white.size, rest, white.count)
@@ -201,7 +199,7 @@ def _inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
 
 def chance(value: float, freedom: int) -> float:
     """Probability that noise alone explains that much (upper tail of chi squared)."""
-    return float(stats.chi2.sf(value, freedom)) if freedom else 1.0
+    return float(scipy.stats.chi2.sf(value, freedom)) if freedom else 1.0
 
 
 def effective_tests(gram: Gram, blocks: Blocks, draws: int = 400, seed: int = 0) -> float:
@@ -218,7 +216,7 @@ def effective_tests(gram: Gram, blocks: Blocks, draws: int = 400, seed: int = 0)
         value, freedom = explained_by(inner, noise[columns])
         for k in {int(f) for f in freedom if f > 0}:
             most = value[freedom == k].max(axis=0)
-            smallest = np.minimum(smallest, stats.chi2.sf(most, k))
+            smallest = np.minimum(smallest, scipy.stats.chi2.sf(most, k))
     # The mean of -log(1 - smallest) of m independent tests is 1/m.
     return max(1.0, 1 / float(np.mean(-np.log1p(-np.minimum(smallest, 1 - 1e-12)))))
 

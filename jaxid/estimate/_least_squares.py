@@ -7,9 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ..loop import ClosedLoop
+from ..sharding import everywhere, shared_out
 from ..simulate import SIGNALS, Batch, each, initial, run_with_sensitivities
 from ._base import Status
 
@@ -137,6 +139,7 @@ class Problem(eqx.Module):
     """Which residual is minimised, and where its parameters may go.
 
     - `free`: one for recordings whose initial state is estimated, else zero.
+    - `mesh`: devices that share the recordings; None for one.
     """
 
     loop: ClosedLoop
@@ -148,21 +151,42 @@ class Problem(eqx.Module):
     upper: Float[Array, " parameters"]
     signals: tuple[str, ...] = eqx.field(static=True)
     free_start: bool = eqx.field(static=True)
+    mesh: Mesh | None = eqx.field(static=True, default=None)
 
 
-@eqx.filter_jit
 def linearise(
     problem: Problem,
     theta: Float[Array, " parameters"],
     start: Float[Array, "recordings initials"],
 ) -> Point:
-    """The problem around parameter values and initial states."""
+    """The problem around parameter values and initial states.
+
+    With a mesh every process has the whole of it afterwards.
+    """
+    if problem.mesh is None:
+        return _linearise(problem, theta, start)
+    point = _linearise(*everywhere((problem, theta, start), problem.mesh))
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), point)
+
+
+@eqx.filter_jit
+def _linearise(
+    problem: Problem,
+    theta: Float[Array, " parameters"],
+    start: Float[Array, "recordings initials"],
+) -> Point:
     n = problem.loop.joints
     loop = problem.loop.with_theta(theta)
     batch = dataclasses.replace(problem.batch, q0=start[:, :n], v0=start[:, n:])
-    found = sensitivity(
-        loop, batch, problem.weights, problem.noise, problem.signals, problem.free_start
-    )
+
+    def part(loop: ClosedLoop, batch: Batch) -> Sensitivity:
+        free_start, signals = problem.free_start, problem.signals
+        return sensitivity(loop, batch, problem.weights, problem.noise, signals, free_start)
+
+    if problem.mesh is None:
+        found = part(loop, batch)
+    else:
+        found = shared_out(part, problem.mesh, loop, batch)
     count, p = start.shape[0], theta.shape[0]
     r = found.residual.reshape(count, -1)
     j = found.jacobian.reshape(count, -1, p)
@@ -290,7 +314,7 @@ def minimise(
     - `max_steps`: largest number of steps, refused ones included.
     - `say`: told about every step.
     """
-    theta = jnp.clip(theta, problem.lower, problem.upper)
+    theta = jnp.asarray(np.clip(theta, problem.lower, problem.upper))
     point = linearise(problem, theta, start)
     if not np.isfinite(point.loss):
         return Minimum(point, Status.diverged, 1)
@@ -302,7 +326,8 @@ def minimise(
         if _step(problem, point, scales, 1e-10)[2] <= tolerance**2 * float(point.loss) / count:
             return Minimum(point, Status.converged, k - 1)
         step, start_step, gain = _step(problem, point, scales, damping)
-        trial = linearise(problem, point.theta + step, point.start + start_step)
+        ahead = np.asarray(point.theta) + step, np.asarray(point.start) + start_step
+        trial = linearise(problem, *map(jnp.asarray, ahead))
         say(f"iteration {k}, weighted squared error {float(trial.loss):.6g}")
         share = (float(point.loss) - float(trial.loss)) / gain
         if share > 0:

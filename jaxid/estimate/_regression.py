@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy import signal
 
 from ..effects import Motion
 from ..errors import FitError
@@ -140,16 +140,10 @@ def regression(
     - `motion`: filtered or simulated position, velocity and acceleration; `tau` is explained.
     """
     n = motion.q.shape[0]
-    label = jnp.full(n, recording_label(recording.name))
-    at = jax.vmap(Motion)(
-        jnp.asarray(motion.time),
-        jnp.asarray(motion.q),
-        jnp.asarray(motion.v),
-        jnp.asarray(motion.a),
-        jnp.asarray(motion.tau),
-        jnp.zeros((n, 0)),
-        label,
-    )
+    label = np.full(n, recording_label(recording.name))
+    along = (motion.time, motion.q, motion.v, motion.a, motion.tau, np.zeros((n, 0)), label)
+    shapes = jax.eval_shape(jax.vmap(Motion), *along)
+    at = jax.device_put(jax.tree.unflatten(jax.tree.structure(shapes), along))
     columns, right = _columns(loop, at)
     return np.asarray(columns), np.asarray(right)
 
@@ -162,6 +156,6 @@ def decimator(
 
     def apply(x: np.ndarray) -> np.ndarray:
         inner = x[trim : x.shape[0] - trim]
-        return inner if factor == 1 else signal.decimate(inner, factor, axis=0)
+        return inner if factor == 1 else scipy.signal.decimate(inner, factor, axis=0)
 
     return apply

@@ -5,7 +5,7 @@ import time
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..errors import FitError
 from ..loop import ClosedLoop
@@ -24,10 +24,18 @@ def physical(loop: ClosedLoop, theta: Float[np.ndarray, " parameters"]) -> Close
 
     - `theta`: values of the parameters in which torque is linear, `(parameters,)`.
     """
+    moved, inertia = _moved(loop, jnp.asarray(theta))
+    return moved if float(inertia) > 0 else loop
+
+
+@eqx.filter_jit
+def _moved(
+    loop: ClosedLoop, theta: Float[Array, " parameters"]
+) -> tuple[ClosedLoop, Float[Array, ""]]:
     chosen = linear_parameters(loop)
     bounds = Bounds.of(chosen)
-    moved = write_values(loop, chosen, bounds.inside(bounds.outside(jnp.asarray(theta))))
-    return moved if float(moved.arm.smallest_inertia()) > 0 else loop
+    moved = write_values(loop, chosen, bounds.inside(bounds.outside(theta)))
+    return moved, moved.arm.smallest_inertia()
 
 
 def _explaining(recordings: Recordings, runs: tuple[Simulated, ...]) -> list[Simulated]:

@@ -131,7 +131,7 @@ def regression_fit(
     notes = []
     if shaped:
         notes.append(f"{', '.join(shaped)} stayed as given: torque is not linear in them")
-    if float(fitted.arm.smallest_inertia()) <= 0:
+    if float(_smallest_inertia(fitted.arm)) <= 0:
         notes.append("these values are not physical: the mass matrix is not positive definite")
     measured = stacked.split(stacked.right)
     residuals = stacked.split(solved.residual)
@@ -150,6 +150,9 @@ def regression_fit(
         solved.undetermined,
         tuple(notes),
     )
+
+
+_smallest_inertia = eqx.filter_jit(lambda arm: arm.smallest_inertia())
 
 
 class IDIM(AbstractMethod):

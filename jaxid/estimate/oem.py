@@ -8,6 +8,7 @@ from typing import Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ..control import OpenLoop
@@ -54,6 +55,7 @@ class OEM(AbstractMethod):
     - `tolerance`: it stops when a step is shorter than this many standard deviations.
     - `max_steps`: largest number of iterations, those for better weights included.
     - `progress`: whether to show it on a terminal.
+    - `mesh`: a `jax.sharding.Mesh` whose devices share the recordings; the numbers stay the same.
     """
 
     output: Output | None = eqx.field(static=True, default=None)
@@ -64,12 +66,14 @@ class OEM(AbstractMethod):
     tolerance: float = 1e-2
     max_steps: int = eqx.field(static=True, default=100)
     progress: bool = eqx.field(static=True, default=True)
+    mesh: Mesh | None = eqx.field(static=True, default=None)
 
     def __repr__(self) -> str:
         changed = [
             f"{field.name}={value!r}"
             for field in dataclasses.fields(self)
-            if field.name != "progress" and (value := getattr(self, field.name)) != field.default
+            if field.name not in ("progress", "mesh")
+            and (value := getattr(self, field.name)) != field.default
         ]
         return f"OEM({', '.join(changed)})"
 
@@ -220,13 +224,14 @@ def _converge(
     weights = jnp.asarray(_first_weights(loop, pieces, signals))
     noise = jnp.asarray(_taps(filters, weights.shape[0]))
     bounds = Bounds.of(loop.free_parameters)
-    start = jnp.concatenate([batch.q0, batch.v0], axis=1)
+    start = jnp.asarray(np.concatenate([batch.q0, batch.v0], axis=1))
     total, minimum = 0, None
     # Until the weights are known, a rough minimum is enough.
     worth = 1e-2
     for _ in range(20):
         within = bounds.lower, bounds.upper
-        problem = Problem(loop, batch, weights, noise, free, *within, signals, bool(free.any()))
+        kinds = signals, bool(free.any()), method.mesh
+        problem = Problem(loop, batch, weights, noise, free, *within, *kinds)
         left = method.max_steps - total
         minimum = minimise(problem, loop.theta, start, method.tolerance, worth, left, say)
         total += minimum.iterations
@@ -235,7 +240,7 @@ def _converge(
         loop, start = loop.with_theta(minimum.point.theta), minimum.point.start
         new = _new_weights(minimum.point.found, batch, weights)
         # Estimates are flat in the weights: those that are a tenth off cost half a percent.
-        settled = bool(jnp.all(jnp.abs(new / weights - 1) < 0.1))
+        settled = bool(np.all(np.abs(np.asarray(new) / np.asarray(weights) - 1) < 0.1))
         if (settled and worth < 1e-2) or total >= method.max_steps:
             break
         weights, worth = new, 1e-4 if settled else worth
@@ -257,10 +262,9 @@ def _new_weights(
     found: Sensitivity, batch: Batch, weights: Float[Array, " outputs"]
 ) -> Float[Array, " outputs"]:
     """One over each output's residual deviation; recorded noise-free outputs keep a floor."""
-    count = jnp.sum(batch.kept)
-    spread = jnp.sqrt(jnp.sum(found.residual**2, axis=(0, 1)) / count) / weights
-    floor = 1e-9 / weights
-    return 1 / jnp.maximum(spread, floor)
+    residual, now = np.asarray(found.residual), np.asarray(weights)
+    spread = np.sqrt(np.sum(residual**2, axis=(0, 1)) / np.sum(np.asarray(batch.kept))) / now
+    return jnp.asarray(1 / np.maximum(spread, 1e-9 / now))
 
 
 def _too_coarse(done: _Done, recordings: Recordings) -> int | None:
@@ -270,10 +274,15 @@ def _too_coarse(done: _Done, recordings: Recordings) -> int | None:
     if isinstance(done.loop.controller, OpenLoop):
         return None
     now = done.loop.stepping.substeps or 1
-    shortest = min(recordings, key=lambda r: r.samples)
-    one = Recordings.of(shortest)
-    runs = [simulate(set_substeps(done.loop, k), one)[0].tau for k in (now, 2 * now)]
-    coarse, fine = (compared(done.loop, one, [np.asarray(tau)])[0] for tau in runs)
+    # A few recordings fit the program that there is already; of many one says enough.
+    one = recordings
+    if len(recordings) > 4:
+        one = Recordings.of(min(recordings, key=lambda r: r.samples))
+    runs = [simulate(set_substeps(done.loop, k), one) for k in (now, 2 * now)]
+    coarse, fine = (
+        np.concatenate(compared(done.loop, one, [np.asarray(run.tau) for run in each]))
+        for each in runs
+    )
     size = np.linalg.norm(fine, axis=0)
     error = np.linalg.norm(coarse - fine, axis=0) / np.where(size > 0, size, 1.0)
     if not np.isfinite(error).all() or error.max() <= 1e-4:

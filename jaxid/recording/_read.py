@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import scipy.io
+import scipy
 
 from ..errors import JaxidError, require
 from ._checks import Gaps, is_number
