@@ -1,12 +1,15 @@
 """The one door to every method."""
 
+import dataclasses
 from collections.abc import Iterable
+
+import numpy as np
 
 from ..errors import FitError
 from ..loop import ClosedLoop
 from ..recording import Recording, Recordings
 from ..simulate import check_joints
-from ._base import AbstractMethod, Fit
+from ._base import AbstractMethod, Fit, Status
 from .oem import OEM
 
 
@@ -30,4 +33,22 @@ def fit(
     method = OEM() if method is None else method
     if not isinstance(method, AbstractMethod):
         raise FitError(f"{method!r} is not a method: give an object such as jaxid.OEM()")
-    return method.fit(loop, recordings)
+    return _honest(method.fit(loop, recordings))
+
+
+def _honest(found: Fit) -> Fit:
+    """The fit, which does not call itself successful where a number is none.
+
+    Infinite deviations are meant: those of what the recordings do not determine.
+    """
+    numbers = {
+        "values": np.where(np.isfinite(found.theta), found.theta, np.nan),
+        "deviations": found.std,
+        "residuals": np.concatenate([np.ravel(r) for r in found.residuals]),
+        "errors": found.error_percent.to_numpy(),
+    }
+    wrong = [name for name, values in numbers.items() if np.isnan(values).any()]
+    if not (wrong and found.succeeded):
+        return found
+    note = f"not a number: some of the {' and '.join(wrong)}"
+    return dataclasses.replace(found, status=Status.overflowed, notes=(*found.notes, note))
