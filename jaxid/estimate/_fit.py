@@ -33,7 +33,7 @@ def fit(
     method = OEM() if method is None else method
     if not isinstance(method, AbstractMethod):
         raise FitError(f"{method!r} is not a method: give an object such as jaxid.OEM()")
-    return _honest(method.fit(loop, recordings))
+    return _doubted(_honest(method.fit(loop, recordings)))
 
 
 def _honest(found: Fit) -> Fit:
@@ -52,3 +52,21 @@ def _honest(found: Fit) -> Fit:
         return found
     note = f"not a number: some of the {' and '.join(wrong)}"
     return dataclasses.replace(found, status=Status.overflowed, notes=(*found.notes, note))
+
+
+# Models that describe a robot leave a few per cent, and noise seldom ten.
+_DOUBTFUL_PERCENT = 30.0
+
+
+def _doubted(found: Fit) -> Fit:
+    """The fit, with what to look at where it leaves more of a signal than a model should."""
+    errors = found.error_percent.max(axis=0)
+    worst = errors[errors > _DOUBTFUL_PERCENT]
+    if worst.empty:
+        return found
+    joints = ", ".join(f"{label} {value:.3g} %" for label, value in worst.items())
+    note = (
+        f"the model does not describe these recordings ({joints} of the signal is left): check "
+        "units, signs, the control law and its gains, and whether there is more motion than noise"
+    )
+    return dataclasses.replace(found, notes=(*found.notes, note))

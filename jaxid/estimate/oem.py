@@ -146,7 +146,7 @@ def start_values(
     for method in (IDIM(), DIDIM(max_steps=4)):
         try:
             found = method.fit(candidates[-1], recordings)
-        except JaxidError:
+        except (JaxidError, np.linalg.LinAlgError):
             continue
         if np.isfinite(found.theta).all():
             candidates.append(physical(loop, _linear_values(found)))
