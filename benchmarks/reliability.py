@@ -108,11 +108,10 @@ def kills(quick: bool) -> dict[str, Any]:
             ended_early += 1
     os.close(log)
     begun = len(log_path.read_text().splitlines())
-    digests = {
-        _digest(_work(folder / f"campaign_{k}", pieces, None)) for k in range(ended_early + 1)
-    }
+    folders = [folder / f"campaign_{k}" for k in range(ended_early + 1)]
+    before = [len(list(one.glob("*.piece"))) for one in folders]
+    digests = {_digest(_work(one, pieces, None)) for one in folders}
     undisturbed = _digest(_work(None, pieces, None))
-    left = [len(list((folder / f"campaign_{k}").glob("*.piece"))) for k in range(ended_early + 1)]
     return {
         "seed": seed,
         "killed": done,
