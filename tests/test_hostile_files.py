@@ -176,7 +176,8 @@ def test_pickles_are_not_opened(tmp_path: Path) -> None:
 
 def test_objects_of_matlab_are_refused(tmp_path: Path) -> None:
     buffer = io.BytesIO()
-    scipy.io.savemat(buffer, {"time": np.zeros(30), "q": np.array([{"a": 1}, "b"], object)})
+    cell = np.array([{"a": 1}, "b"], object)
+    scipy.io.savemat(buffer, {"time": np.zeros(30), "q": cell, "tau": np.zeros((30, 1))})
     assert "'q' is a cell variable" in refused(tmp_path / "run.mat", buffer.getvalue())
 
 
