@@ -60,9 +60,9 @@ _DOUBTFUL_PERCENT = 30.0
 
 def _doubted(found: Fit) -> Fit:
     """The fit, with what to look at where it leaves more of a signal than a model should."""
-    errors = found.error_percent.max(axis=0)
-    worst = errors[errors > _DOUBTFUL_PERCENT]
-    if worst.empty:
+    errors = dict(found.error_percent.max(axis=0))
+    worst = {label: value for label, value in errors.items() if value > _DOUBTFUL_PERCENT}
+    if not worst:
         return found
     joints = ", ".join(f"{label} {value:.3g} %" for label, value in worst.items())
     note = (
