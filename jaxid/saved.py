@@ -75,13 +75,12 @@ def load(
 
 
 def registry(classes: Iterable[type] = ()) -> dict[tuple[str, str], type]:
-    """The classes that a file may hold: jaxid's public ones, diffrax's steps, and those given."""
+    """The classes that a file may hold: jaxid's own, diffrax's steps, and those given."""
     loaded = _below(eqx.Module) | _below(enum.Enum)
     ours = {c for c in loaded if c.__module__.startswith("jaxid.")}
     bases = (diffrax.AbstractSolver, diffrax.AbstractStepSizeController, diffrax.AbstractAdjoint)
     theirs = {c for c in vars(diffrax).values() if isinstance(c, type) and issubclass(c, bases)}
-    known = {c for c in ours | theirs if not c.__name__.startswith("_")}
-    return archive.registered([*known, *classes])
+    return archive.registered([*ours, *theirs, *classes])
 
 
 def _below(cls: type) -> set[type]:

@@ -75,7 +75,7 @@ def test_killed_at_random_moments_it_gives_the_same(tmp_path: Path) -> None:
     assert len(list((tmp_path / "killed").glob("*.piece"))) == 100
     # Each death loses what it was at, which is begun again, and nothing else is.
     begun = len((tmp_path / "log").read_text().splitlines())
-    assert 100 < begun <= 112
+    assert 100 <= begun <= 112
     assert not list((tmp_path / "killed").glob(".*.part"))
     with Campaign(None, {"seed": 7}) as nowhere:
         undisturbed = dict(nowhere.run(draw, pieces))

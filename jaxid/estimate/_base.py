@@ -26,7 +26,9 @@ class Status(enum.Enum):
     converged = "converged"
     stalled = "stopped without progress before the tolerance was met"
     max_steps = "reached the largest number of iterations; raise max_steps"
+    max_seconds = "reached its limit of time; raise max_seconds"
     diverged = "no parameter values were found at which the loop can be simulated"
+    overflowed = "its numbers leave what float64 holds; check the units of the recordings"
 
 
 class Fit(eqx.Module):

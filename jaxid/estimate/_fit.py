@@ -1,12 +1,15 @@
 """The one door to every method."""
 
+import dataclasses
 from collections.abc import Iterable
+
+import numpy as np
 
 from ..errors import FitError
 from ..loop import ClosedLoop
 from ..recording import Recording, Recordings
 from ..simulate import check_joints
-from ._base import AbstractMethod, Fit
+from ._base import AbstractMethod, Fit, Status
 from .oem import OEM
 
 
@@ -30,4 +33,40 @@ def fit(
     method = OEM() if method is None else method
     if not isinstance(method, AbstractMethod):
         raise FitError(f"{method!r} is not a method: give an object such as jaxid.OEM()")
-    return method.fit(loop, recordings)
+    return _doubted(_honest(method.fit(loop, recordings)))
+
+
+def _honest(found: Fit) -> Fit:
+    """The fit, which does not call itself successful where a number is none.
+
+    Infinite deviations are meant: those of what the recordings do not determine.
+    """
+    numbers = {
+        "values": np.where(np.isfinite(found.theta), found.theta, np.nan),
+        "deviations": found.std,
+        "residuals": np.concatenate([np.ravel(r) for r in found.residuals]),
+        "errors": found.error_percent.to_numpy(),
+    }
+    wrong = [name for name, values in numbers.items() if np.isnan(values).any()]
+    if not (wrong and found.succeeded):
+        return found
+    note = f"not a number: some of the {' and '.join(wrong)}"
+    return dataclasses.replace(found, status=Status.overflowed, notes=(*found.notes, note))
+
+
+# Models that describe a robot leave a few per cent, and noise seldom ten.
+_DOUBTFUL_PERCENT = 30.0
+
+
+def _doubted(found: Fit) -> Fit:
+    """The fit, with what to look at where it leaves more of a signal than a model should."""
+    errors = dict(found.error_percent.max(axis=0))
+    worst = {label: value for label, value in errors.items() if value > _DOUBTFUL_PERCENT}
+    if not worst:
+        return found
+    joints = ", ".join(f"{label} {value:.3g} %" for label, value in worst.items())
+    note = (
+        f"the model does not describe these recordings ({joints} of the signal is left): check "
+        "units, signs, the control law and its gains, and whether there is more motion than noise"
+    )
+    return dataclasses.replace(found, notes=(*found.notes, note))

@@ -1,6 +1,8 @@
 """The residual of a simulated loop as a function of its parameters, and its minimisation."""
 
 import dataclasses
+import math
+import time
 from collections.abc import Callable
 
 import equinox as eqx
@@ -300,6 +302,7 @@ def minimise(
     worth: float,
     max_steps: int,
     say: Callable[[str], None],
+    deadline: float = math.inf,
 ) -> Minimum:
     """Levenberg–Marquardt inside bounds, over parameters and initial states together.
 
@@ -313,6 +316,7 @@ def minimise(
     - `worth`: when five steps together lower the loss by less than this share.
     - `max_steps`: largest number of steps, refused ones included.
     - `say`: told about every step.
+    - `deadline`: of `time.perf_counter`, looked at before every step.
     """
     theta = jnp.asarray(np.clip(theta, problem.lower, problem.upper))
     point = linearise(problem, theta, start)
@@ -322,6 +326,8 @@ def minimise(
     scales, damping, growth = _Scales.of(point), 1e-3, 2.0
     losses = [float(point.loss)]
     for k in range(2, max_steps + 1):
+        if time.perf_counter() > deadline:
+            return Minimum(point, Status.max_seconds, k - 1)
         # What a full step promises, in units of the residual's own spread.
         if _step(problem, point, scales, 1e-10)[2] <= tolerance**2 * float(point.loss) / count:
             return Minimum(point, Status.converged, k - 1)

@@ -1,6 +1,7 @@
 """The output-error method: simulate the closed loop, compare, follow the exact gradient."""
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -54,6 +55,7 @@ class OEM(AbstractMethod):
     - `deviations`: `"sandwich"` for coloured residuals, `"white"` for (A.1) as in the paper.
     - `tolerance`: it stops when a step is shorter than this many standard deviations.
     - `max_steps`: largest number of iterations, those for better weights included.
+    - `max_seconds`: longest time, looked at between iterations; what is found until then is given.
     - `progress`: whether to show it on a terminal.
     - `mesh`: a `jax.sharding.Mesh` whose devices share the recordings; the numbers stay the same.
     """
@@ -65,6 +67,7 @@ class OEM(AbstractMethod):
     deviations: Deviations = eqx.field(static=True, default="sandwich")
     tolerance: float = 1e-2
     max_steps: int = eqx.field(static=True, default=100)
+    max_seconds: float = eqx.field(static=True, default=math.inf)
     progress: bool = eqx.field(static=True, default=True)
     mesh: Mesh | None = eqx.field(static=True, default=None)
 
@@ -87,15 +90,50 @@ class OEM(AbstractMethod):
         # What does not fit together is said before the work, not after it.
         _signals(self, loop)
         prepare(loop, pieces_of(recordings, self.window))
+        deadline = started + self.max_seconds
         with working(f"OEM of {loop.name}", self.progress) as say:
-            loop = start_values(loop, recordings, self.start, say)
-            loop = with_substeps(loop, recordings)
-            done = _converge(self, loop, recordings, say)
-            finer = _too_coarse(done, recordings)
-            if finer is not None:
+            done = self._from_start(loop, recordings, say, deadline)
+            kept = recordings
+            if done.minimum.status is Status.diverged:
+                kept = _without_diverging(done.loop, recordings)
+            if len(kept) < len(recordings):
+                done = self._from_start(loop, kept, say, deadline)
+            finer = _too_coarse(done, kept)
+            if finer is not None and time.perf_counter() < deadline:
                 say(f"again with {finer} steps between samples")
-                done = _converge(self, set_substeps(done.loop, finer), recordings, say)
-        return _report(self, done, recordings, time.perf_counter() - started)
+                finer_loop = set_substeps(done.loop, finer)
+                done = _converge(self, finer_loop, kept, say, deadline=deadline)
+        found = _report(self, done, kept, time.perf_counter() - started)
+        return dataclasses.replace(found, notes=(*found.notes, *_left_out(recordings, kept)))
+
+    def _from_start(
+        self,
+        loop: ClosedLoop,
+        recordings: Recordings,
+        say: Callable[[str], None],
+        deadline: float,
+    ) -> "_Done":
+        loop = start_values(loop, recordings, self.start, say)
+        loop = with_substeps(loop, recordings)
+        return _converge(self, loop, recordings, say, deadline=deadline)
+
+
+def _without_diverging(loop: ClosedLoop, recordings: Recordings) -> Recordings:
+    """The recordings along which the loop can be simulated; all of them where it cannot at all."""
+    runs = simulate(loop, recordings)
+    sound = [np.isfinite(run.states).all() and np.isfinite(run.tau).all() for run in runs]
+    kept = [r for r, good in zip(recordings, sound, strict=True) if good]
+    return Recordings.of(kept) if kept else recordings
+
+
+def _left_out(recordings: Recordings, kept: Recordings) -> list[str]:
+    gone = [name for name in recordings.names if name not in kept.names]
+    if not gone:
+        return []
+    return [
+        f"{len(gone)} of {len(recordings)} recordings left out, the loop diverges when it is "
+        f"simulated along them: {', '.join(gone)}"
+    ]
 
 
 def start_values(
@@ -112,7 +150,7 @@ def start_values(
     for method in (IDIM(), DIDIM(max_steps=4)):
         try:
             found = method.fit(candidates[-1], recordings)
-        except JaxidError:
+        except (JaxidError, np.linalg.LinAlgError):
             continue
         if np.isfinite(found.theta).all():
             candidates.append(physical(loop, _linear_values(found)))
@@ -210,12 +248,14 @@ def _converge(
     recordings: Recordings,
     say: Callable[[str], None],
     filters: Sequence[ARFilter] | None = None,
+    deadline: float = math.inf,
 ) -> _Done:
     """Minimises, then again with the weights and initial states that follow, until they settle.
 
     **Arguments:**
 
     - `filters`: noise filter of each output; white noise where None.
+    - `deadline`: of `time.perf_counter`; past it, what there is is given.
     """
     pieces = pieces_of(recordings, method.window)
     signals = _signals(method, loop)
@@ -233,7 +273,9 @@ def _converge(
         kinds = signals, bool(free.any()), method.mesh
         problem = Problem(loop, batch, weights, noise, free, *within, *kinds)
         left = method.max_steps - total
-        minimum = minimise(problem, loop.theta, start, method.tolerance, worth, left, say)
+        minimum = minimise(
+            problem, loop.theta, start, method.tolerance, worth, left, say, deadline
+        )
         total += minimum.iterations
         if minimum.status is Status.diverged:
             break
@@ -242,6 +284,8 @@ def _converge(
         # Estimates are flat in the weights: those that are a tenth off cost half a percent.
         settled = bool(np.all(np.abs(np.asarray(new) / np.asarray(weights) - 1) < 0.1))
         if (settled and worth < 1e-2) or total >= method.max_steps:
+            break
+        if minimum.status is Status.max_seconds:
             break
         weights, worth = new, 1e-4 if settled else worth
     assert minimum is not None

@@ -47,23 +47,28 @@ class SeparablePEM(AbstractMethod):
         started = time.perf_counter()
         with working(f"SeparablePEM of {loop.name}", self.oem.progress) as say:
             loop = with_substeps(start_values(loop, recordings, self.oem.start, say), recordings)
-            done = self._alternate(loop, recordings, say)
+            deadline = started + self.oem.max_seconds
+            done = self._alternate(loop, recordings, say, deadline)
         how = "equation (A.1) with the gradient of the filtered error"
         method = dataclasses.replace(self.oem, deviations="white")
         return _report(method, done, recordings, time.perf_counter() - started, self, how)
 
     def _alternate(
-        self, loop: ClosedLoop, recordings: Recordings, say: Callable[[str], None]
+        self,
+        loop: ClosedLoop,
+        recordings: Recordings,
+        say: Callable[[str], None],
+        deadline: float,
     ) -> _Done:
         if self.filters is not None:
-            return _converge(self.oem, loop, recordings, say, self.filters)
-        done = _converge(self.oem, loop, recordings, say)
+            return _converge(self.oem, loop, recordings, say, self.filters, deadline)
+        done = _converge(self.oem, loop, recordings, say, deadline=deadline)
         before = np.inf
         for _ in range(self.rounds):
-            if done.minimum.status is Status.diverged:
+            if done.minimum.status in (Status.diverged, Status.max_seconds):
                 break
             filters = noise_filters(done, self.criterion, self.highest)
-            done = _converge(self.oem, done.loop, recordings, say, filters)
+            done = _converge(self.oem, done.loop, recordings, say, filters, deadline)
             spread = float(np.sum(np.log(1 / np.asarray(done.weights))))
             if abs(before - spread) < self.tolerance:
                 break

@@ -16,6 +16,7 @@ Gaps = Literal["refuse", "allow"]
 Labels = Mapping[str, Sequence[str]]
 
 _FEWEST_SAMPLES = 20
+_LARGEST = 1e30
 
 
 def numeric(source: str, column: str, values: object) -> Float64[np.ndarray, "..."]:
@@ -120,6 +121,7 @@ def validate(
         with np.errstate(over="ignore"):
             checked[signal] = values * scale[signal]
         _finite(source, signal, checked[signal], labels)
+        _bounded(source, signal, checked[signal], labels)
     _increasing(source, checked["time"], labels, gaps)
     for signal in ("q", "tau"):
         _moving(source, signal, checked[signal], labels)
@@ -181,6 +183,19 @@ def _finite(source: str, signal: str, values: Float64[np.ndarray, "..."], labels
         f"({table[row, joint]})",
         "remove that row or cut the recording there",
     )
+
+
+def _bounded(source: str, signal: str, values: Float64[np.ndarray, "..."], labels: Labels) -> None:
+    """Squares and products of what is larger leave float64, and no robot is that large."""
+    table = values.reshape(len(values), -1)
+    row, joint = np.unravel_index(np.abs(table).argmax(), table.shape)
+    if abs(table[row, joint]) > _LARGEST:
+        raise problem(
+            source,
+            f"{_label(labels, signal, int(joint), table.shape[1])} reaches {table[row, joint]:.3g} "
+            f"in SI units at row {row + 1}",
+            "correct that row, or name the unit it is in",
+        )
 
 
 def _increasing(

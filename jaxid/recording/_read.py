@@ -5,6 +5,9 @@ import gzip
 import io
 import itertools
 import os
+import struct
+import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,12 +15,16 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from ..errors import JaxidError, require
+from ..archive import npy
+from ..errors import JaxidError, RecordingError, require
 from ._checks import Gaps, is_number
 from ._columns import Columns, Table, from_frame, pick, unique
 from ._problem import brief, problem
 from ._recording import Recording, Recordings, build
 from ._units import Units
+
+# Two million samples of seven columns as text; a laptop holds what reading them takes.
+LARGEST = 256 * 2**20
 
 
 def read(
@@ -26,6 +33,7 @@ def read(
     units: Units | None = None,
     resolution: float | int | Sequence[float] | None = None,
     gaps: Gaps = "refuse",
+    largest: int = LARGEST,
 ) -> Recordings:
     """Reads recordings from `.csv`, `.tsv`, `.txt` (or these `.gz`), `.parquet`, `.mat`, `.npz`.
 
@@ -40,13 +48,17 @@ def read(
       where silent, `q_ref` as `q`, `tau_ff` as `tau`.
     - `resolution`: encoder step, one or one for each joint, rad or m.
     - `gaps`: `"allow"` to accept missing stretches of time.
+    - `largest`: size in bytes, unpacked, above which a file is refused; text takes about ten times
+      that much memory while it is read.
 
     **Raises:** `RecordingError` for whatever makes a file unusable; `MissingExtraError` for a
     format whose extra is not installed.
     """
     if not paths:
         raise problem("read()", "no file was given", "pass at least one path")
-    return Recordings.of(_read_one(Path(path), columns, units, resolution, gaps) for path in paths)
+    return Recordings.of(
+        _read_one(Path(path), columns, units, resolution, gaps, largest) for path in paths
+    )
 
 
 def _read_one(
@@ -55,14 +67,16 @@ def _read_one(
     units: Units | None,
     resolution: float | int | Sequence[float] | None,
     gaps: Gaps,
+    largest: int,
 ) -> Recording:
     source = str(path)
     zipped = path.suffix.lower() == ".gz"
     inner = path.with_suffix("") if zipped else path
-    data = _bytes(source, path)
+    data = _bytes(source, path, largest)
     reader = _reader(source, inner.suffix.lower(), zipped)
     try:
-        table = reader(source, gzip.decompress(data) if zipped else data)
+        data = _gunzip(source, data, largest) if zipped else data
+        table = reader(source, data, largest)
     except JaxidError:
         raise
     except Exception as error:  # parsers of broken files raise nearly anything
@@ -76,7 +90,7 @@ def _read_one(
     return build(source, inner.stem, picked, units, resolution, gaps)
 
 
-def _reader(source: str, extension: str, zipped: bool) -> Callable[[str, bytes], Table]:
+def _reader(source: str, extension: str, zipped: bool) -> Callable[[str, bytes, int], Table]:
     match extension:
         case ".csv" | ".tsv" | ".txt":
             return _text
@@ -93,23 +107,49 @@ def _reader(source: str, extension: str, zipped: bool) -> Callable[[str, bytes],
     )
 
 
-def _bytes(source: str, path: Path) -> bytes:
+def _bytes(source: str, path: Path, largest: int) -> bytes:
     try:
-        data = path.read_bytes()
+        # A pipe or a device would be read for ever.
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise problem(source, "is no plain file", "copy its content to a file")
+        if path.is_file() and path.stat().st_size > largest:
+            raise _too_large(source, path.stat().st_size, largest)
+        with open(path, "rb") as file:
+            data = file.read(largest + 1)
     except FileNotFoundError as error:
         raise problem(source, "there is no such file", "check the path") from error
     except IsADirectoryError as error:
         raise problem(source, "is a directory", "name the files in it") from error
+    except RecordingError:
+        raise
     except (OSError, ValueError, MemoryError) as error:
         raise problem(
             source, f"cannot be opened ({error})", "check the path and permissions"
         ) from error
     if not data:
         raise problem(source, "the file is empty", "record or copy it again")
+    if len(data) > largest:
+        raise _too_large(source, len(data), largest)
     return data
 
 
-def _text(source: str, data: bytes) -> Table:
+def _too_large(source: str, size: int, largest: int) -> RecordingError:
+    return problem(
+        source,
+        f"holds at least {size} bytes unpacked, more than the {largest} that are read",
+        "cut it into shorter recordings, or pass read(..., largest=) if it is yours",
+    )
+
+
+def _gunzip(source: str, data: bytes, largest: int) -> bytes:
+    with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+        text = file.read(largest + 1)
+    if len(text) > largest:
+        raise _too_large(source, len(text), largest)
+    return text
+
+
+def _text(source: str, data: bytes, largest: int) -> Table:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -179,20 +219,27 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return next(csv.reader([line], delimiter=delimiter))
 
 
-def _parquet(source: str, data: bytes) -> Table:
+def _parquet(source: str, data: bytes, largest: int) -> Table:
     parquet = require("pyarrow.parquet", "parquet")
     file = parquet.ParquetFile(io.BytesIO(data), page_checksum_verification=True)
+    groups = [file.metadata.row_group(k) for k in range(file.metadata.num_row_groups)]
+    # A page of one value can stand for any number of rows.
+    cells = sum(group.num_rows for group in groups) * file.metadata.num_columns
+    size = max(sum(group.total_byte_size for group in groups), 8 * cells)
+    if size > largest:
+        raise _too_large(source, size, largest)
     # The metadata of pandas could make a column an index and so hide it.
     return from_frame(source, file.read().to_pandas(ignore_metadata=True))
 
 
-def _mat(source: str, data: bytes) -> Table:
+def _mat(source: str, data: bytes, largest: int) -> Table:
     if data.startswith(b"MATLAB 7.3") or b"\x89HDF\r\n\x1a\n" in data[:1024]:
         raise problem(
             source,
             "is a MATLAB file of version 7.3 (HDF5)",
             "save it again in MATLAB with save(file, '-v7')",
         )
+    _check_unpacked(source, data, largest)
     listed = scipy.io.whosmat(io.BytesIO(data))
     unique(source, [name for name, _, _ in listed])
     odd = ("cell", "struct", "object", "function", "opaque", "sparse", "unknown")
@@ -206,21 +253,58 @@ def _mat(source: str, data: bytes) -> Table:
     )
 
 
-def _npz(source: str, data: bytes) -> Table:
-    archive = np.load(io.BytesIO(data), allow_pickle=False)
-    if not isinstance(archive, np.lib.npyio.NpzFile):
+def _check_unpacked(source: str, data: bytes, largest: int) -> None:
+    """Refuses a MATLAB file whose compressed variables unpack to more than is read.
+
+    A variable is a tag of type and length, then its bytes; 15 is for zlib (MATLAB's MAT-File
+    Format, version 5).
+    """
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
+    if order is None:
+        # Version 4 knows no compression.
+        return
+    at, left = 128, largest
+    while at + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        if kind == 15:
+            unpacker = zlib.decompressobj()
+            packed = data[at + 8 : at + 8 + size]
+            while packed and not unpacker.eof:
+                left -= len(unpacker.decompress(packed, 2**20))
+                if left < 0:
+                    raise _too_large(source, largest - left, largest)
+                packed = unpacker.unconsumed_tail
+        at += 8 + size
+
+
+def _npz(source: str, data: bytes, largest: int) -> Table:
+    if data.startswith(np.lib.format.MAGIC_PREFIX):
+        npy(data)
         raise problem(
             source, "holds one bare array", "save named arrays with np.savez(file, time=..., q=...)"
         )
-    unique(source, archive.files)
-    columns = {}
-    for name in archive.files:
-        try:
-            columns[name] = archive[name]
-        except ValueError as error:
-            raise problem(
-                source,
-                f"array {brief(name)} cannot be read ({error})",
-                "save plain arrays of numbers with np.savez, no Python objects",
-            ) from error
-    return Table(columns)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = archive.infolist()
+        size = sum(entry.file_size for entry in entries)
+        if size > largest:
+            raise _too_large(source, size, largest)
+        names = [entry.filename.removesuffix(".npy") for entry in entries]
+        unique(source, names)
+        columns, refused = {}, {}
+        for name, entry in zip(names, entries, strict=True):
+            if name == entry.filename:
+                refused[name] = "file of another kind"
+            else:
+                columns[name] = _array(source, name, archive.read(entry))
+    return Table(columns, refused)
+
+
+def _array(source: str, name: str, content: bytes) -> np.ndarray:
+    try:
+        return npy(content)
+    except ValueError as error:
+        raise problem(
+            source,
+            f"array {brief(name)} cannot be read ({error})",
+            "save plain arrays of numbers with np.savez, no Python objects",
+        ) from error

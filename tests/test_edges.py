@@ -1,0 +1,194 @@
+"""Numbers at the edge: a right answer or a named reason, never a number that is none."""
+
+import dataclasses
+import math
+import zlib
+from typing import Any
+
+import equinox as eqx
+import independent as sim
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxid
+from jaxid.errors import RecordingError
+
+pytestmark = pytest.mark.xdist_group("edges")
+
+# Long enough for every parameter, and of one shape: compiled once for all tests here.
+SECONDS = 4.0
+QUIET = jaxid.OEM(progress=False)
+
+
+@pytest.fixture(scope="session")
+def case() -> Any:
+    """A SCARA with encoders and coloured noise."""
+    return sim.make_case(41, duration=SECONDS)
+
+
+def record(case: Any, name: str, *, true: bool = False, **changed: Any) -> jaxid.Recording:
+    rows = case.recordings[name]
+    q, tau = ("q_true", "tau_true") if true else ("q", "tau")
+    signals = {"time": rows["time"], "q": rows[q], "tau": rows[tau], "q_ref": rows["q_ref"]}
+    return jaxid.Recording.from_arrays(**signals | changed, name=name)
+
+
+def pair(case: Any, **settings: Any) -> list[jaxid.Recording]:
+    return [record(case, name, **settings) for name in ("fit_1", "fit_2")]
+
+
+@pytest.fixture(scope="session")
+def plain(case: Any) -> jaxid.Fit:
+    """The fit that the others are held against."""
+    return jaxid.fit(jaxid.scara(), pair(case), QUIET)
+
+
+def sound(fit: jaxid.Fit) -> None:
+    """Asserts that a success holds no number that is none."""
+    assert np.isfinite(fit.theta).all()
+    assert not np.isnan(fit.std).any()
+    assert not np.isnan(fit.error_percent.to_numpy()).any()
+
+
+# --- recordings -----------------------------------------------------------------------------------
+
+
+def test_identical_recordings_say_nothing_new(case: Any, plain: jaxid.Fit) -> None:
+    one = record(case, "fit_1")
+    twice = jaxid.fit(jaxid.scara(), [one, dataclasses.replace(one, name="again")], QUIET)
+    assert twice.succeeded
+    sound(twice)
+    # Its own coloured noise is counted twice: deviations shrink by at most the square root of two.
+    assert np.all(twice.std < 3 * plain.std)
+
+
+def test_without_noise_the_deviations_are_finite(case: Any) -> None:
+    fit = jaxid.fit(jaxid.scara(), pair(case, true=True), QUIET)
+    truth = np.array([getattr(case.plant, n) for n in fit.names])
+    assert fit.succeeded
+    sound(fit)
+    assert np.abs(fit.theta / truth - 1).max() < 5e-3
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_torque_in_a_wrong_unit_is_said(case: Any, scale: float) -> None:
+    wrong = [record(case, n, tau=scale * case.recordings[n]["tau"]) for n in ("fit_1", "fit_2")]
+    loop = dataclasses.replace(jaxid.scara(), stepping=jaxid.Stepping(substeps=4))
+    fit = jaxid.fit(loop, wrong, dataclasses.replace(QUIET, start="given"))
+    sound(fit)
+    assert any("does not describe these recordings" in note for note in fit.notes)
+    assert any("check units" in note for note in fit.notes)
+
+
+@pytest.mark.parametrize("signal", ["time", "q", "tau", "q_ref"])
+def test_what_no_robot_reaches_is_refused(case: Any, signal: str) -> None:
+    with pytest.raises(RecordingError, match=r"reaches .* in SI units|spans more"):
+        record(case, "fit_1", **{signal: 1e200 * case.recordings["fit_1"][signal]})
+
+
+# --- models ---------------------------------------------------------------------------------------
+
+
+class Runaway(jaxid.effects.AbstractEffect):
+    """Drives itself without bound, along one recording."""
+
+    joint: int = eqx.field(static=True)
+    rate: jax.Array = jaxid.parameter(1e6, symbol="run", unit="N·m", free=False)
+
+    def torque(self, motion: jaxid.effects.Motion) -> jax.Array:
+        here = motion.label == (zlib.crc32(b"fit_2") & 0x7FFFFFFF)
+        push = jnp.where(here, self.rate * motion.v[self.joint - 1] ** 3, 0.0)
+        return jaxid.effects.on_joint(self.joint, -push, motion)
+
+
+def test_a_recording_that_diverges_is_left_out_and_named(case: Any) -> None:
+    loop = jaxid.scara().add(Runaway(joint=2))
+    given = dataclasses.replace(QUIET, start="given")
+    fit = jaxid.fit(loop, pair(case), given)
+    assert fit.recordings.names == ("fit_1",)
+    assert any("1 of 2 recordings left out" in n and "fit_2" in n for n in fit.notes)
+    sound(fit)
+    alone = jaxid.fit(loop, record(case, "fit_2"), given)
+    assert alone.status is jaxid.Status.diverged
+
+
+def test_time_is_bounded(case: Any, plain: jaxid.Fit) -> None:
+    method = dataclasses.replace(QUIET, max_seconds=0.0)
+    fit = jaxid.fit(jaxid.scara(), pair(case), method)
+    assert fit.status is jaxid.Status.max_seconds
+    assert not fit.succeeded
+    sound(fit)
+    assert fit.iterations <= 2 < plain.iterations
+    assert math.isinf(jaxid.OEM().max_seconds)
+
+
+class Wrong(jaxid.estimate.AbstractMethod):
+    """A method that calls nonsense a success."""
+
+    fit_as: jaxid.Fit
+
+    def fit(self, loop: jaxid.ClosedLoop, recordings: jaxid.Recordings) -> jaxid.Fit:
+        return self.fit_as
+
+
+def test_no_success_with_a_number_that_is_none(plain: jaxid.Fit) -> None:
+    negative = -np.eye(len(plain.names))
+    lost = plain.loop.with_theta(jnp.full(len(plain.names), jnp.inf))
+    for wrong in (
+        dataclasses.replace(plain, covariance=negative),
+        dataclasses.replace(plain, loop=lost),
+        dataclasses.replace(plain, error_percent=plain.error_percent * np.nan),
+    ):
+        with np.errstate(invalid="ignore"):
+            fit = jaxid.fit(plain.loop, plain.recordings, Wrong(wrong))
+        assert fit.status is jaxid.Status.overflowed
+        assert "not a number" in fit.notes[-1]
+    # What is infinitely uncertain is an answer.
+    infinite = dataclasses.replace(plain, covariance=np.full_like(plain.covariance, np.inf))
+    assert jaxid.fit(plain.loop, plain.recordings, Wrong(infinite)).succeeded
+
+
+# --- what physics says of changed recordings ------------------------------------------------------
+
+
+def test_shifted_in_time_the_same(case: Any, plain: jaxid.Fit) -> None:
+    later = [record(case, n, time=case.recordings[n]["time"] + 1000.0) for n in ("fit_1", "fit_2")]
+    fit = jaxid.fit(jaxid.scara(), later, QUIET)
+    # Times near 1000 s are rounded to 1e-13 s.
+    assert np.abs(fit.theta - plain.theta).max() < 1e-6 * np.abs(plain.theta).max()
+
+
+def test_in_another_order_the_same(case: Any, plain: jaxid.Fit) -> None:
+    fit = jaxid.fit(jaxid.scara(), pair(case)[::-1], QUIET)
+    # It stops within a hundredth of a deviation, from either side.
+    assert np.all(np.abs(fit.theta - plain.theta) < 0.03 * plain.std)
+
+
+def test_twice_the_same_to_the_bit(case: Any, plain: jaxid.Fit) -> None:
+    fit = jaxid.fit(jaxid.scara(), pair(case), QUIET)
+    assert fit.theta.tobytes() == plain.theta.tobytes()
+    assert fit.covariance.tobytes() == plain.covariance.tobytes()
+
+
+def test_mirrored_joints_mirror_what_is_odd(case: Any, plain: jaxid.Fit) -> None:
+    # Both angles and torques negated: inertia and friction stay, MY2 (odd in q2) changes its sign.
+    turned = [
+        record(case, n, **{s: -case.recordings[n][s] for s in ("q", "tau", "q_ref")})
+        for n in ("fit_1", "fit_2")
+    ]
+    fit = jaxid.fit(jaxid.scara(), turned, QUIET)
+    sign = np.where(np.array(fit.names) == "MY2", -1.0, 1.0)
+    assert np.all(np.abs(sign * fit.theta - plain.theta) < 0.03 * plain.std)
+
+
+def test_torque_and_gains_in_another_unit_scale_the_parameters(case: Any, plain: jaxid.Fit) -> None:
+    # Everything in units of ten newton metres: parameters are a tenth, deviations too.
+    scaled = [record(case, n, tau=0.1 * case.recordings[n]["tau"]) for n in ("fit_1", "fit_2")]
+    loop = jaxid.scara()
+    law = dataclasses.replace(loop.controller, Kg=0.1 * loop.controller.Kg)
+    loop = dataclasses.replace(loop, controller=law).with_theta(0.1 * loop.theta)
+    fit = jaxid.fit(loop, scaled, QUIET)
+    assert np.all(np.abs(10 * fit.theta - plain.theta) < 0.05 * plain.std)
+    assert np.allclose(10 * fit.std, plain.std, rtol=0.02)
