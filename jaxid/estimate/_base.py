@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from .. import figures
 from ..loop import ClosedLoop
+from ..noise import ARFilter, VectorAR
 from ..recording import Recording, Recordings
 from ..saved import save
 
@@ -38,6 +39,10 @@ class Fit(eqx.Module):
       `(samples, joints)` for each recording.
     - `undetermined`: sentences that name the directions the data say nothing about.
     - `notes`: what else a reader should know.
+    - `noise`: the noise filters found or given, one for each output or one of all; None for white.
+    - `rounds`: how often parameters and filters were estimated in turn.
+    - `optimum`: the least-squares problem at its minimum, from which deviations, bootstrap and
+      profile follow; None for regressions.
     """
 
     loop: ClosedLoop
@@ -53,6 +58,9 @@ class Fit(eqx.Module):
     deviations: str = eqx.field(static=True, default="")
     undetermined: tuple[str, ...] = eqx.field(static=True, default=())
     notes: tuple[str, ...] = eqx.field(static=True, default=())
+    noise: tuple[ARFilter, ...] | VectorAR | None = None
+    rounds: int = eqx.field(static=True, default=0)
+    optimum: Any = None
 
     @property
     def succeeded(self) -> bool:
