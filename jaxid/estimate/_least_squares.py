@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..loop import ClosedLoop
-from ..simulate import SIGNALS, Batch, each, initial, run_with_sensitivities
+from ..simulate import SIGNALS, Batch, each, initial, run, run_with_sensitivities
 from ._base import Status
 
 
@@ -82,6 +82,26 @@ def unfiltered(
         residual, slopes = batch.band(residual), batch.band(slopes)
     by_start = slopes[..., p:] if free_start else None
     return Sensitivity(residual, residual, slopes[..., :p], by_start)
+
+
+def raw_residual(
+    loop: ClosedLoop,
+    batch: Batch,
+    weights: Float[Array, " outputs"],
+    signals: tuple[str, ...],
+) -> Float[Array, "recordings samples outputs"]:
+    """Weighted residual before any noise filter, without derivatives."""
+    rows = jnp.asarray([SIGNALS.index(s) for s in signals])
+
+    def one(intervals, at, q0, v0):
+        _, seen = run(loop, intervals, initial(loop, intervals, q0, v0))
+        seen = seen[:, rows] if at is None else seen[at][:, rows]
+        return seen.reshape(seen.shape[0], -1)
+
+    seen = each(one, batch.intervals, batch.at, batch.q0, batch.v0)
+    measured = jnp.concatenate([getattr(batch, s) for s in signals], axis=-1)
+    residual = (measured - seen) * weights * batch.mask[..., None]
+    return residual if batch.band is None else batch.band(residual)
 
 
 def through_filter(
@@ -254,11 +274,16 @@ class Problem(eqx.Module):
         - `extra`: values of the noise filter's coefficients.
         """
         plain = unfiltered(loop, batch, self.weights, self.signals, self.free_start)
+        return self.whitened(plain, extra)
+
+    def whitened(self, plain: Sensitivity, extra: Float[Array, " _"]) -> Sensitivity:
+        """The unfiltered residual through the noise filter, with the coefficients' derivatives."""
+        kept = self.batch.kept
         if self.coefficients is None:
-            known = known_rows(self.noise, batch.kept)
+            known = known_rows(self.noise, kept)
             found = through_filter(plain, self.noise, known)
         else:
-            known = self.coefficients.known(batch.kept)
+            known = self.coefficients.known(kept)
             noise = self.coefficients.into(self.noise, extra)
             found = through_filter(plain, noise, known)
             past = self.coefficients.derivative(plain.raw) * known[..., None]
@@ -289,6 +314,17 @@ def linearise(
     loop = problem.loop.with_theta(theta[:own])
     batch = dataclasses.replace(problem.batch, q0=start[:, :n], v0=start[:, n:])
     found = problem.linearised(loop, batch, theta[own:])
+    return products(problem, theta, start, found)
+
+
+def products(
+    problem: Problem,
+    theta: Float[Array, " parameters"],
+    start: Float[Array, "recordings initials"],
+    found: Sensitivity,
+) -> Point:
+    """What a step needs of a linearisation."""
+    loop = problem.loop.with_theta(theta[: problem.loop.theta.shape[0]])
     count, p = start.shape[0], theta.shape[0]
     r = found.residual.reshape(count, -1)
     j = found.jacobian.reshape(count, -1, p)

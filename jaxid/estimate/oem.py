@@ -151,7 +151,7 @@ class _Done(eqx.Module):
     def optimum(self) -> Optimum:
         """Where it ended, for whatever asks how sure that is."""
         point = self.minimum.point
-        return Optimum(self.problem, np.asarray(point.theta), np.asarray(point.start))
+        return Optimum(self.problem, point.theta, point.start)
 
 
 def pieces_of(recordings: Recordings, window: float | None) -> tuple[Recording, ...]:
