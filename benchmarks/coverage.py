@@ -56,7 +56,7 @@ def intervals(fit: jaxid.Fit, found: Refitted, kind: str) -> np.ndarray:
 def literal(fit: jaxid.Fit, found: Refitted) -> np.ndarray:
     """The paper's printed formula in every draw: its lambda with the unfiltered gradient."""
     base = jaxid.deviations(fit)["paper"].to_numpy()
-    own = np.concatenate([r for r in Reduced.of(fit.optimum).residuals])
+    own = np.concatenate(Reduced.of(fit.optimum).residuals)
     scale = _in_units(fit)
 
     def variance(e: np.ndarray) -> np.ndarray:

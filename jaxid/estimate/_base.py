@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from .. import figures
 from ..loop import ClosedLoop
-from ..noise import ARFilter, VectorAR
+from ..noise import ARFilter, VectorAR, innovations, ljung_box
 from ..recording import Recording, Recordings
 from ..saved import save
 
@@ -86,6 +86,36 @@ class Fit(eqx.Module):
     def units(self) -> tuple[str, ...]:
         """One unit for each value."""
         return tuple(self.loop.unit(p) for p in self.loop.free_parameters for _ in p.names)
+
+    @property
+    def innovations(self) -> tuple[Float[np.ndarray, "_samples joints"], ...]:
+        """Residuals through the inverse of the noise filters; zero where the past is not known."""
+        noise = self.noise
+        if noise is not None and not isinstance(noise, VectorAR):
+            noise = noise[: self.loop.joints]
+        return tuple(innovations(r, noise) for r in self.residuals)
+
+    def whiteness(self, lags: int = 38) -> pd.DataFrame:
+        """Ljung and Box's test of residuals and innovations by joint, and the filter's order.
+
+        **Arguments:**
+
+        - `lags`: at least; twenty more than the order of a filter.
+        """
+        rows = []
+        for j in range(self.loop.joints):
+            order = 0
+            if isinstance(self.noise, VectorAR):
+                order = self.noise.order
+            elif self.noise is not None:
+                order = self.noise[j].order
+            reach = max(lags, order + 20)
+            before = ljung_box([r[:, j] for r in self.residuals], reach)
+            after = ljung_box([e[order:, j] for e in self.innovations], reach, order)
+            rows.append((order, before.p_value, after.p_value))
+        columns = ["order", "residuals_p", "innovations_p"]
+        index = pd.Index(joint_columns(self.loop.joints), name="joint")
+        return pd.DataFrame(rows, columns=columns, index=index)
 
     def table(self) -> pd.DataFrame:
         """Value, unit, standard deviation and relative deviation (A.4) of each parameter."""

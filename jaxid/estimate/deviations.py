@@ -11,13 +11,12 @@ import pandas as pd
 from jaxtyping import Float
 
 from ..errors import FitError
-from ..noise import ARFilter, VectorAR, fit_ar
+from ..noise import Noise, fit_ar, innovations
 from ..parameters import Bounds
 from ._base import Fit, determined_covariance
 from ._least_squares import Problem, Sensitivity, absorb_start, linearise, unfiltered
 
 Deviations = Literal["sandwich", "white", "paper"]
-Noise = Sequence[ARFilter] | VectorAR | None
 
 SAID = {
     "sandwich": "sandwich estimate, right for whatever colour the residuals have",
@@ -139,27 +138,11 @@ def _papers_information(
     plain = unfiltered(loop, batch, units, problem.signals, False)
     raw, kept = np.asarray(plain.raw), np.asarray(batch.kept)
     total = sum(
-        float(np.sum(filtered(x[there], noise) ** 2)) for x, there in zip(raw, kept, strict=True)
+        float(np.sum(innovations(x[there], noise) ** 2)) for x, there in zip(raw, kept, strict=True)
     )
     variance = total / kept.sum()
     jacobian = np.asarray(plain.jacobian)
     return np.einsum("rkop,rkoq->pq", jacobian, jacobian) / variance
-
-
-def filtered(
-    x: Float[np.ndarray, "samples outputs"], noise: Noise
-) -> Float[np.ndarray, "samples outputs"]:
-    """Residuals through the inverse of noise filters; rows that need an unknown past are zero."""
-    if noise is None:
-        return x
-    if isinstance(noise, VectorAR):
-        white = noise.whiten(x)
-        white[: noise.order] = 0.0
-        return white
-    white = np.stack([f.whiten(column) for f, column in zip(noise, x.T, strict=True)], axis=1)
-    for column, filt in zip(white.T, noise, strict=True):
-        column[: filt.order] = 0.0
-    return white
 
 
 def score_covariance(

@@ -11,14 +11,14 @@ from jaxtyping import Float
 
 from ..errors import NoiseError
 from ..loop import ClosedLoop
-from ..noise import ARFilter, VectorAR, check_series
+from ..noise import ARFilter, Noise, VectorAR, check_series
 from ..parameters import Bounds
 from ..progress import working
 from ..recording import Recordings
 from ..simulate import prepare, with_substeps
 from ._base import AbstractMethod, Fit, Status
 from ._least_squares import Coefficients, Minimum, Problem, minimise
-from .deviations import Deviations, Noise
+from .deviations import Deviations
 from .oem import (
     OEM,
     _converge,
@@ -30,7 +30,7 @@ from .oem import (
     pieces_of,
     start_values,
 )
-from .pem import Order, keeping, noise_filters, output_name, residual_series
+from .pem import Order, keeping, noise_filters
 
 
 class JointPEM(AbstractMethod):
@@ -122,7 +122,7 @@ def _converge_jointly(
         loop, batch, weights, blank, free, lower, upper, signals, bool(free.any()),
         coefficients, jnp.eye(outputs),
     )  # fmt: skip
-    _check_samples(problem, orders, method, recordings, pieces)
+    _check_samples(problem, orders)
     theta = jnp.concatenate([loop.theta, jnp.asarray(_starting(problem, noise))])
     start = jnp.concatenate([batch.q0, batch.v0], axis=1)
     total, worth = 0, 1e-2
@@ -144,14 +144,14 @@ def _converge_jointly(
     return _Done(fitted, pieces, batch, weights, minimum, problem, signals, total)
 
 
-def _check_samples(problem: Problem, orders, method: JointPEM, recordings, pieces) -> None:
+def _check_samples(problem: Problem, orders: Sequence[int]) -> None:
     """Refuses orders that the recordings do not allow, before any work."""
     kept = np.asarray(problem.batch.kept)
-    names = [f"joint {k % problem.loop.joints + 1}" for k in range(len(orders))]
+    signals = [np.asarray(getattr(problem.batch, s)) for s in problem.signals]
     for output, order in enumerate(orders):
-        measured = np.asarray(problem.batch.tau)[..., output % problem.loop.joints]
-        series = [x[there] for x, there in zip(measured, kept, strict=True)]
-        check_series(series, order, names[output])
+        signal, joint = divmod(output, problem.loop.joints)
+        series = [x[there, joint] for x, there in zip(signals[signal], kept, strict=True)]
+        check_series(series, order, f"joint {joint + 1}")
 
 
 def _starting(problem: Problem, noise: Noise) -> Float[np.ndarray, " coefficients"]:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..control import OpenLoop
 from ..errors import FitError, JaxidError
 from ..loop import ClosedLoop
-from ..noise import ARFilter, VectorAR
+from ..noise import ARFilter, Noise, VectorAR
 from ..parameters import Bounds
 from ..progress import working
 from ..recording import Recording, Recordings
@@ -28,7 +28,7 @@ from ..simulate import (
 )
 from ._base import AbstractMethod, Fit, Status, relative_errors
 from ._least_squares import Minimum, Problem, Sensitivity, minimise
-from .deviations import SAID, Deviations, Noise, Optimum, covariance_of
+from .deviations import SAID, Deviations, Optimum, covariance_of
 from .didim import DIDIM, physical
 from .idim import IDIM
 

@@ -1,8 +1,9 @@
 """Separable prediction error: the output error through the inverse of an estimated noise filter."""
 
+import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal
 
 import equinox as eqx
@@ -10,12 +11,12 @@ import numpy as np
 
 from ..errors import NoiseError
 from ..loop import ClosedLoop
-from ..noise import ARFilter, VectorAR, check_series, fit_ar, fit_var
+from ..noise import ARFilter, Noise, VectorAR, check_series, fit_ar, fit_var, innovations
 from ..progress import working
 from ..recording import Recordings
 from ..simulate import with_substeps
 from ._base import AbstractMethod, Fit, Status
-from .deviations import Deviations, Noise, filtered
+from .deviations import Deviations
 from .oem import OEM, _converge, _Done, _report, start_values
 
 
@@ -107,18 +108,14 @@ class SeparablePEM(AbstractMethod):
         return done, noise, self.rounds
 
 
-class keeping:
+@contextlib.contextmanager
+def keeping(done: _Done, method: OEM, recordings: Recordings) -> Iterator[None]:
     """Hands the fit so far on with a `NoiseError`."""
-
-    def __init__(self, done: _Done, method: OEM, recordings: Recordings):
-        self.done, self.method, self.recordings = done, method, recordings
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind, error, trace) -> None:
-        if isinstance(error, NoiseError):
-            error.fit = _report(self.method, self.done, self.recordings, 0.0)
+    try:
+        yield
+    except NoiseError as error:
+        error.fit = _report(method, done, recordings, 0.0)
+        raise
 
 
 def residual_series(done: _Done) -> list[np.ndarray]:
@@ -168,7 +165,7 @@ def output_name(done: _Done, output: int) -> str:
 
 def prediction_spread(done: _Done, noise: Noise) -> float:
     """Logarithm of the determinant of the prediction error's covariance."""
-    white = [filtered(x, noise) for x in residual_series(done)]
+    white = [innovations(x, noise) for x in residual_series(done)]
     together = np.concatenate(white)
     together = together[np.any(together != 0, axis=1)]
     return float(np.sum(np.log(np.mean(together**2, axis=0))))

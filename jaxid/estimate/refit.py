@@ -73,12 +73,12 @@ class Refitted(eqx.Module):
       filter coefficients can explain taken out.
     """
 
-    theta: Float[Array, "*lanes values"]
-    loss: Float[Array, "*lanes"]
-    last: Float[Array, "*lanes"]
-    raw: Float[Array, "*lanes recordings samples outputs"]
-    residual: Float[Array, "*lanes recordings samples outputs"]
-    jacobian: Float[Array, "*lanes recordings samples outputs parameters"]
+    theta: Float[Array | np.ndarray, "*lanes values"]
+    loss: Float[Array | np.ndarray, "*lanes"]
+    last: Float[Array | np.ndarray, "*lanes"]
+    raw: Float[Array | np.ndarray, "*lanes recordings samples outputs"]
+    residual: Float[Array | np.ndarray, "*lanes recordings samples outputs"]
+    jacobian: Float[Array | np.ndarray, "*lanes recordings samples outputs parameters"]
 
 
 def measured_of(problem: Problem) -> Float[Array, "recordings samples outputs"]:
@@ -178,18 +178,7 @@ def _own_columns(problem: Problem, point: Point) -> Float[Array, "recordings sam
 
 
 @eqx.filter_jit
-def refit(optimum: Optimum, lanes: Lanes, steps: int = 4) -> Refitted:
-    """Fits of a problem with other signals, filters, bounds or start values, vmapped.
-
-    Gauss-Newton with weights kept: some steps with the sensitivities of the problem's own values,
-    which need no more than a simulation each, and a last one with those of where they led. For
-    fits that end close to the problem's own, as `Refitted.last` tells.
-
-    **Arguments:**
-
-    - `optimum`: of a fit; its values and initial states are where sensitivities are taken.
-    - `steps`: how many before the last.
-    """
+def _refit_some(optimum: Optimum, lanes: Lanes, steps: int) -> Refitted:
     problem, start = optimum.problem, jnp.asarray(optimum.start)
     n, own = problem.loop.joints, problem.loop.theta.shape[0]
     loop = problem.loop.with_theta(jnp.asarray(optimum.theta)[:own])
@@ -214,7 +203,28 @@ def refit(optimum: Optimum, lanes: Lanes, steps: int = 4) -> Refitted:
         raw = found.raw + near.jacobian @ -step[:own]
         return Refitted(theta + step, jnp.sum(residual**2), last, raw, residual, columns)
 
-    return jax.lax.map(one, lanes, batch_size=min(LANES, lanes.theta.shape[0]))
+    return jax.vmap(one)(lanes)
+
+
+def refit(optimum: Optimum, lanes: Lanes, steps: int = 4) -> Refitted:
+    """Fits of a problem with other signals, filters, bounds or start values, vmapped.
+
+    Gauss-Newton with weights kept: some steps with the sensitivities of the problem's own values,
+    which need no more than a simulation each, and a last one with those of where they led. For
+    fits that end close to the problem's own, as `Refitted.last` tells.
+
+    **Arguments:**
+
+    - `optimum`: of a fit; its values and initial states are where sensitivities are taken.
+    - `steps`: how many before the last.
+    """
+    count, pieces = lanes.theta.shape[0], []
+    for begin in range(0, count, LANES):
+        # Always as many, the last ones again where they run out: one program serves all counts.
+        rows = np.minimum(np.arange(begin, begin + LANES), count - 1)
+        some = jax.tree.map(lambda x, rows=rows: x[rows], lanes)
+        pieces.append(jax.tree.map(np.asarray, _refit_some(optimum, some, steps)))
+    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *pieces)
 
 
 def redrawn(

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy import linalg, signal
 
 from ..errors import NoiseError
-from .ar import Criterion, check_series, choose
+from .ar import ARFilter, Criterion, check_series, choose
 
 
 class VectorAR(eqx.Module):
@@ -53,12 +53,14 @@ class VectorAR(eqx.Module):
         taps[..., 1 : self.order + 1] = np.moveaxis(self.coefficients, 0, -1)
         return taps
 
-    def whiten(self, x: Float[np.ndarray, "samples outputs"]) -> Float[np.ndarray, "samples outputs"]:
+    def whiten(
+        self, x: Float[np.ndarray, "samples outputs"]
+    ) -> Float[np.ndarray, "samples outputs"]:
         """e of a noise; what came before the first sample counts as zero."""
         taps = self.taps(self.order + 1)
         return np.stack(
             [
-                sum(np.asarray(signal.lfilter(row, [1.0], column)) for row, column in zip(a, x.T))
+                sum(np.asarray(signal.lfilter(b, [1.0], y)) for b, y in zip(a, x.T, strict=True))
                 for a in taps
             ],
             axis=1,
@@ -165,3 +167,23 @@ def _nuttall_strand(
         )
         found.append(VectorAR(np.stack(a), ahead))
     return found
+
+
+# Filters of each output, one of all outputs, or white noise.
+Noise = Sequence[ARFilter] | VectorAR | None
+
+
+def innovations(
+    x: Float[np.ndarray, "samples outputs"], noise: Noise
+) -> Float[np.ndarray, "samples outputs"]:
+    """Residuals through the inverse of noise filters; rows that need an unknown past are zero."""
+    if noise is None:
+        return x
+    if isinstance(noise, VectorAR):
+        white = noise.whiten(x)
+        white[: noise.order] = 0.0
+        return white
+    white = np.stack([f.whiten(column) for f, column in zip(noise, x.T, strict=True)], axis=1)
+    for column, filt in zip(white.T, noise, strict=True):
+        column[: filt.order] = 0.0
+    return white
