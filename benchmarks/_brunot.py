@@ -30,10 +30,10 @@ SAMPLES = 2001
 
 
 def polynomial(order: int, seed: int) -> np.ndarray:
-    """A stable AR polynomial of that order whose noise is some hundred times its innovation.
+    """A stable AR polynomial of that order, with noise some sixty times its innovation's variance.
 
     The paper prints orders and deviations only. Its ratio of 9.7 to 10 between the deviations of
-    OEM and PEM is, by its formulas, that between noise and innovation; so it is here.
+    OEM and PEM is, by its formulas, the root of that factor; here it comes to 8.
     """
     rng = np.random.default_rng(seed)
     reflection = 0.12 * rng.uniform(-1, 1, order)

@@ -125,6 +125,9 @@ def covariance_of(
     return determined_covariance(np.asarray(information), names, scales, meat)
 
 
+_plain = eqx.filter_jit(unfiltered)
+
+
 def _papers_information(
     optimum: Optimum, noise: Noise
 ) -> Float[np.ndarray, "parameters parameters"]:
@@ -135,7 +138,7 @@ def _papers_information(
     start = jnp.asarray(optimum.start)
     batch = dataclasses.replace(problem.batch, q0=start[:, :n], v0=start[:, n:])
     units = jnp.ones_like(problem.weights)
-    plain = unfiltered(loop, batch, units, problem.signals, False)
+    plain = _plain(loop, batch, units, problem.signals, False)
     raw, kept = np.asarray(plain.raw), np.asarray(batch.kept)
     total = sum(
         float(np.sum(innovations(x[there], noise) ** 2)) for x, there in zip(raw, kept, strict=True)
