@@ -35,7 +35,6 @@ from .estimate import OEM as OEM  # noqa: E402
 from .estimate import Filtering as Filtering  # noqa: E402
 from .estimate import Fit as Fit  # noqa: E402
 from .estimate import JointPEM as JointPEM  # noqa: E402
-from .estimate import Order as Order  # noqa: E402
 from .estimate import SeparablePEM as SeparablePEM  # noqa: E402
 from .estimate import Status as Status  # noqa: E402
 from .estimate import bootstrap as bootstrap  # noqa: E402

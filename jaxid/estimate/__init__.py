@@ -14,7 +14,6 @@ from .didim import IDIMIV as IDIMIV
 from .idim import IDIM as IDIM
 from .joint_pem import JointPEM as JointPEM
 from .oem import OEM as OEM
-from .pem import Order as Order
 from .pem import SeparablePEM as SeparablePEM
 from .profile import Profile as Profile
 from .profile import profile as profile

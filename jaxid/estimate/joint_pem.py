@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..errors import NoiseError
 from ..loop import ClosedLoop
-from ..noise import ARFilter, Noise, VectorAR, check_series
+from ..noise import ARFilter, Criterion, Noise, VectorAR, check_series
 from ..parameters import Bounds
 from ..progress import working
 from ..recording import Recordings
@@ -44,7 +44,8 @@ class JointPEM(AbstractMethod):
 
     - `oem`: output, start, initial states and bounds are those of this method.
     - `orders`: of the AR filters, one for each output, whose coefficients then start at zero; None
-      to fit by `oem` first, choose orders from its residuals as `order` says, and start there.
+      to fit by `oem` first, choose orders from its residuals, and start there.
+    - `criterion`, `highest`, `white`: how, as for `SeparablePEM`.
     - `coupled`: every output's filter takes the past of all outputs.
     - `deviations`: `"white"` for (A.1), `"sandwich"` or `"paper"`.
 
@@ -53,12 +54,14 @@ class JointPEM(AbstractMethod):
 
     oem: OEM = OEM()
     orders: tuple[int, ...] | None = eqx.field(static=True, default=None)
-    order: Order = Order()
+    criterion: Criterion = eqx.field(static=True, default="aic")
+    highest: int = eqx.field(static=True, default=50)
+    white: float | None = eqx.field(static=True, default=0.05)
     coupled: bool = eqx.field(static=True, default=False)
     deviations: Deviations = eqx.field(static=True, default="white")
 
     def __repr__(self) -> str:
-        said = self.order.criterion if self.orders is None else f"orders={self.orders}"
+        said = self.criterion if self.orders is None else f"orders={self.orders}"
         return f"JointPEM({said}{', coupled' if self.coupled else ''})"
 
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
@@ -84,7 +87,8 @@ class JointPEM(AbstractMethod):
             return self.orders, None, None
         first = _converge(self.oem, loop, recordings, say)
         with keeping(first, self.oem, recordings):
-            noise = noise_filters(first, self.order, None, self.coupled)
+            order = Order(self.criterion, self.highest, self.white)
+            noise = noise_filters(first, order, None, self.coupled)
         if isinstance(noise, VectorAR):
             return [noise.order] * noise.outputs, noise, first
         return [f.order for f in noise], noise, first

@@ -4,14 +4,23 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from ..errors import NoiseError
 from ..loop import ClosedLoop
-from ..noise import ARFilter, Noise, VectorAR, check_series, fit_ar, fit_var, innovations
+from ..noise import (
+    ARFilter,
+    Criterion,
+    Noise,
+    VectorAR,
+    check_series,
+    fit_ar,
+    fit_var,
+    innovations,
+)
 from ..progress import working
 from ..recording import Recordings
 from ..simulate import with_substeps
@@ -20,19 +29,12 @@ from .deviations import Deviations
 from .oem import OEM, _converge, _Done, _report, start_values
 
 
-class Order(eqx.Module):
-    """How the orders of noise filters are chosen.
+class Order(NamedTuple):
+    """How the orders of noise filters are chosen; see `SeparablePEM`."""
 
-    **Arguments:**
-
-    - `criterion`: `"aic"`, `"aicc"` or `"bic"`, over 0..`highest`.
-    - `white`: significance at which Ljung and Box's test refuses an order whose innovations are
-      not white (CAPTAIN's `aic` has such a condition, Young 2011); None for the criterion alone.
-    """
-
-    criterion: Literal["aic", "aicc", "bic"] = eqx.field(static=True, default="aic")
-    highest: int = eqx.field(static=True, default=50)
-    white: float | None = eqx.field(static=True, default=0.05)
+    criterion: Criterion
+    highest: int
+    white: float | None
 
 
 class SeparablePEM(AbstractMethod):
@@ -45,7 +47,10 @@ class SeparablePEM(AbstractMethod):
 
     - `oem`: output, start, initial states and bounds are those of this method.
     - `filters`: noise filters to use as given, one for each output; None to estimate them.
-    - `orders`: of the filters, one for each output; None to choose them as `order` says.
+    - `criterion`: `"aic"`, `"aicc"` or `"bic"`, by which the orders are chosen over 0..`highest`.
+    - `white`: significance at which Ljung and Box's test refuses an order whose innovations are
+      not white (CAPTAIN's `aic` has such a condition, Young 2011); None for the criterion alone.
+    - `orders`: of the filters, one for each output, in place of a choice.
     - `coupled`: one filter for all joints together, each driven by the past of all.
     - `first_step`: `"filtered"` for parameters from the filtered error; `"plain"` for the paper's
       own variant, whose parameters ignore the filter and stay those of output error.
@@ -59,8 +64,10 @@ class SeparablePEM(AbstractMethod):
 
     oem: OEM = OEM()
     filters: tuple[ARFilter, ...] | VectorAR | None = None
+    criterion: Criterion = eqx.field(static=True, default="aic")
+    highest: int = eqx.field(static=True, default=50)
+    white: float | None = eqx.field(static=True, default=0.05)
     orders: tuple[int, ...] | None = eqx.field(static=True, default=None)
-    order: Order = Order()
     coupled: bool = eqx.field(static=True, default=False)
     first_step: Literal["filtered", "plain"] = eqx.field(static=True, default="filtered")
     deviations: Deviations | None = eqx.field(static=True, default=None)
@@ -68,7 +75,7 @@ class SeparablePEM(AbstractMethod):
     rounds: int = eqx.field(static=True, default=10)
 
     def __repr__(self) -> str:
-        said = self.order.criterion if self.orders is None else f"orders={self.orders}"
+        said = self.criterion if self.orders is None else f"orders={self.orders}"
         given = "filters given" if self.filters is not None else said
         more = ", coupled" if self.coupled else ""
         plain = ", first_step='plain'" if self.first_step == "plain" else ""
@@ -98,7 +105,8 @@ class SeparablePEM(AbstractMethod):
             if done.minimum.status is Status.diverged:
                 return done, noise, k - 1
             with keeping(done, self.oem, recordings):
-                noise = noise_filters(done, self.order, self.orders, self.coupled)
+                order = Order(self.criterion, self.highest, self.white)
+                noise = noise_filters(done, order, self.orders, self.coupled)
             if self.first_step == "filtered":
                 done = _converge(self.oem, done.loop, recordings, say, noise)
             spread = prediction_spread(done, noise)

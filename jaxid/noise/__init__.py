@@ -1,6 +1,7 @@
 """Noise models: autoregressive filters, their order, whiteness."""
 
 from .ar import ARFilter as ARFilter
+from .ar import Criterion as Criterion
 from .ar import check_series as check_series
 from .ar import fit_ar as fit_ar
 from .ar import orders as orders
