@@ -257,7 +257,7 @@ class Problem(eqx.Module):
     loop: ClosedLoop
     batch: Batch
     weights: Float[Array, " outputs"]
-    noise: Float[Array, "outputs taps"]
+    noise: Float[Array, "outputs *taps"]
     free: Float[Array, " recordings"]
     lower: Float[Array, " parameters"]
     upper: Float[Array, " parameters"]

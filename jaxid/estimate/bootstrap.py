@@ -5,7 +5,7 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..errors import FitError
 from ..noise import ARFilter, VectorAR, fit_ar
@@ -22,7 +22,7 @@ class Bootstrap(eqx.Module):
 
     fit: Fit
     theta: Float[np.ndarray, "draws parameters"]
-    settled: Float[np.ndarray, " draws"]
+    settled: Bool[np.ndarray, " draws"]
 
     @property
     def std(self) -> Float[np.ndarray, " parameters"]:
