@@ -17,7 +17,7 @@ GIVEN = jaxid.OEM(start="given", progress=False)
 ORDERS = (2, 3)
 FILTERS = (
     ARFilter.from_reflection(np.array([-0.95, 0.85])),
-    ARFilter.from_reflection(np.array([-0.9, 0.8, 0.2])),
+    ARFilter.from_reflection(np.array([-0.985, 0.97, 0.2])),
 )
 
 
@@ -86,7 +86,8 @@ def test_filters_are_those_of_the_noise_and_leave_white_innovations(fits):
 def test_the_noise_model_buys_precision(fits):
     ratio = fits["sep"].std / fits["oem"].std
     assert np.all(ratio < 1.15)
-    assert ratio.min() < 0.9
+    # Where the resonance of joint 2 stands among the frequencies that its friction shows in.
+    assert ratio.min() < 0.8
     assert "filtered error" in fits["sep"].deviations
     assert "sandwich" in fits["oem"].deviations
 
