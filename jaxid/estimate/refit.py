@@ -276,7 +276,7 @@ def refit_signals(
     white = jnp.zeros_like(lanes.noise).at[..., 0].set(1.0)
     first = refit(optimum, dataclasses.replace(lanes, noise=white), steps)
     taps = _taps_by_draw(np.asarray(first.raw), problem, fit.noise)
-    again = dataclasses.replace(lanes, noise=jnp.asarray(taps), theta=first.theta)
+    again = dataclasses.replace(lanes, noise=jnp.asarray(taps), theta=jnp.asarray(first.theta))
     return refit(optimum, again, steps)
 
 
