@@ -34,9 +34,14 @@ from .estimate import IDIMIV as IDIMIV  # noqa: E402
 from .estimate import OEM as OEM  # noqa: E402
 from .estimate import Filtering as Filtering  # noqa: E402
 from .estimate import Fit as Fit  # noqa: E402
+from .estimate import JointPEM as JointPEM  # noqa: E402
 from .estimate import SeparablePEM as SeparablePEM  # noqa: E402
 from .estimate import Status as Status  # noqa: E402
+from .estimate import bootstrap as bootstrap  # noqa: E402
+from .estimate import deviations as deviations  # noqa: E402
 from .estimate import fit as fit  # noqa: E402
+from .estimate import profile as profile  # noqa: E402
+from .estimate import with_deviations as with_deviations  # noqa: E402
 from .loop import ClosedLoop as ClosedLoop  # noqa: E402
 from .parameters import parameter as parameter  # noqa: E402
 from .recording import Recording as Recording  # noqa: E402

@@ -3,6 +3,7 @@
 import importlib
 import textwrap
 from types import ModuleType
+from typing import Any
 
 
 class JaxidError(Exception):
@@ -23,6 +24,17 @@ class FitError(JaxidError, RuntimeError):
 
 class SaveError(JaxidError, ValueError):
     """A saved result, or a piece of a campaign, cannot be written or read."""
+
+
+class NoiseError(FitError):
+    """A noise filter was asked for that the residuals do not allow.
+
+    `fit` is what had been estimated by then, None where nothing had.
+    """
+
+    def __init__(self, message: str, fit: Any = None):
+        super().__init__(message)
+        self.fit = fit
 
 
 class MissingExtraError(JaxidError, ImportError):

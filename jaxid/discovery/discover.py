@@ -490,7 +490,7 @@ class _Search(eqx.Module):
     def alternating(self) -> SeparablePEM:
         """The method with noise filters estimated along with the parameters."""
         method = dataclasses.replace(_quiet(self.method), start="given")
-        return SeparablePEM(method, criterion="bic", highest=30, rounds=3)
+        return SeparablePEM(method, criterion="bic", highest=30, white=None, rounds=3)
 
     def whitened_method(self, diagnosis: Diagnosis) -> SeparablePEM:
         """The method with the noise filters of a diagnosis: efficient where noise is coloured."""

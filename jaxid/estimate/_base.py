@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from .. import figures
 from ..loop import ClosedLoop
+from ..noise import ARFilter, VectorAR, innovations, ljung_box
 from ..recording import Recording, Recordings
 from ..saved import save
 
@@ -40,6 +41,10 @@ class Fit(eqx.Module):
       `(samples, joints)` for each recording.
     - `undetermined`: sentences that name the directions the data say nothing about.
     - `notes`: what else a reader should know.
+    - `noise`: the noise filters found or given, one for each output or one of all; None for white.
+    - `rounds`: how often parameters and filters were estimated in turn.
+    - `optimum`: the least-squares problem at its minimum, from which deviations, bootstrap and
+      profile follow; None for regressions.
     """
 
     loop: ClosedLoop
@@ -55,6 +60,9 @@ class Fit(eqx.Module):
     deviations: str = eqx.field(static=True, default="")
     undetermined: tuple[str, ...] = eqx.field(static=True, default=())
     notes: tuple[str, ...] = eqx.field(static=True, default=())
+    noise: tuple[ARFilter, ...] | VectorAR | None = None
+    rounds: int = eqx.field(static=True, default=0)
+    optimum: Any = None
 
     @property
     def succeeded(self) -> bool:
@@ -80,6 +88,36 @@ class Fit(eqx.Module):
     def units(self) -> tuple[str, ...]:
         """One unit for each value."""
         return tuple(self.loop.unit(p) for p in self.loop.free_parameters for _ in p.names)
+
+    @property
+    def innovations(self) -> tuple[Float[np.ndarray, "_samples joints"], ...]:
+        """Residuals through the inverse of the noise filters; zero where the past is not known."""
+        noise = self.noise
+        if noise is not None and not isinstance(noise, VectorAR):
+            noise = noise[: self.loop.joints]
+        return tuple(innovations(r, noise) for r in self.residuals)
+
+    def whiteness(self, lags: int = 38) -> pd.DataFrame:
+        """Ljung and Box's test of residuals and innovations by joint, and the filter's order.
+
+        **Arguments:**
+
+        - `lags`: at least; twenty more than the order of a filter.
+        """
+        rows = []
+        for j in range(self.loop.joints):
+            order = 0
+            if isinstance(self.noise, VectorAR):
+                order = self.noise.order
+            elif self.noise is not None:
+                order = self.noise[j].order
+            reach = max(lags, order + 20)
+            before = ljung_box([r[:, j] for r in self.residuals], reach)
+            after = ljung_box([e[order:, j] for e in self.innovations], reach, order)
+            rows.append((order, before.p_value, after.p_value))
+        columns = ["order", "residuals_p", "innovations_p"]
+        index = pd.Index(joint_columns(self.loop.joints), name="joint")
+        return pd.DataFrame(rows, columns=columns, index=index)
 
     def table(self) -> pd.DataFrame:
         """Value, unit, standard deviation and relative deviation (A.4) of each parameter."""

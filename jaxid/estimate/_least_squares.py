@@ -3,18 +3,18 @@
 import dataclasses
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..loop import ClosedLoop
 from ..sharding import everywhere, shared_out
-from ..simulate import SIGNALS, Batch, each, initial, run_with_sensitivities
+from ..simulate import SIGNALS, Batch, each, initial, run, run_with_sensitivities
 from ._base import Status
 
 
@@ -49,6 +49,18 @@ def sensitivity(
     - `signals`: which of `"tau"` and `"q"` are outputs.
     - `free_start`: whether initial states are parameters too.
     """
+    plain = unfiltered(loop, batch, weights, signals, free_start)
+    return through_filter(plain, noise, known_rows(noise, batch.kept))
+
+
+def unfiltered(
+    loop: ClosedLoop,
+    batch: Batch,
+    weights: Float[Array, " outputs"],
+    signals: tuple[str, ...],
+    free_start: bool,
+) -> Sensitivity:
+    """`sensitivity` before any noise filter: the only pass through the simulation."""
     rows = tuple(SIGNALS.index(s) for s in signals)
     p, n = loop.theta.shape[0], loop.joints
 
@@ -72,29 +84,128 @@ def sensitivity(
     slopes = -slopes * scale[..., None]
     if batch.band is not None:
         residual, slopes = batch.band(residual), batch.band(slopes)
-    white = filtered_by(noise, jnp.concatenate([residual[..., None], slopes], axis=-1))
-    # What came before the first sample is not known, so neither are the first filtered rows.
-    taps = noise.shape[1] - jnp.argmax((noise != 0)[:, ::-1], axis=1) - 1
-    row = jnp.cumsum(batch.kept, axis=1) - 1
-    white = white * (batch.kept[..., None] & (row[..., None] >= taps))[..., None]
-    slopes = white[..., 1:]
     by_start = slopes[..., p:] if free_start else None
-    return Sensitivity(residual, white[..., 0], slopes[..., :p], by_start)
+    return Sensitivity(residual, residual, slopes[..., :p], by_start)
+
+
+def raw_residual(
+    loop: ClosedLoop,
+    batch: Batch,
+    weights: Float[Array, " outputs"],
+    signals: tuple[str, ...],
+) -> Float[Array, "recordings samples outputs"]:
+    """Weighted residual before any noise filter, without derivatives."""
+    rows = jnp.asarray([SIGNALS.index(s) for s in signals])
+
+    def one(intervals, at, q0, v0):
+        _, seen = run(loop, intervals, initial(loop, intervals, q0, v0))
+        seen = seen[:, rows] if at is None else seen[at][:, rows]
+        return seen.reshape(seen.shape[0], -1)
+
+    seen = each(one, batch.intervals, batch.at, batch.q0, batch.v0)
+    measured = jnp.concatenate([getattr(batch, s) for s in signals], axis=-1)
+    residual = (measured - seen) * weights * batch.mask[..., None]
+    return residual if batch.band is None else batch.band(residual)
+
+
+def through_filter(
+    plain: Sensitivity,
+    noise: Float[Array, "..."],
+    known: Bool[Array, "recordings samples outputs"],
+) -> Sensitivity:
+    """Residual and derivatives through the inverse of the noise filters.
+
+    **Arguments:**
+
+    - `noise`: polynomials, `(outputs, taps)`, or matrices of them where one output's noise
+      drives another's, `(outputs, outputs, taps)`; padded with zeros.
+    - `known`: which filtered rows count.
+    """
+    p = plain.jacobian.shape[-1]
+    columns = [plain.raw[..., None], plain.jacobian]
+    if plain.start is not None:
+        columns.append(plain.start)
+    white = filtered_by(noise, jnp.concatenate(columns, axis=-1))
+    white = white * known[..., None]
+    by_start = None if plain.start is None else white[..., p + 1 :]
+    return Sensitivity(plain.raw, white[..., 0], white[..., 1 : p + 1], by_start)
+
+
+def known_rows(
+    noise: Float[Array, "..."], kept: Bool[Array, "recordings samples"]
+) -> Bool[Array, "recordings samples outputs"]:
+    """Which filtered rows need nothing from before the first sample, which nobody knows."""
+    used = noise != 0 if noise.ndim == 2 else jnp.any(noise != 0, axis=1)
+    taps = used.shape[1] - jnp.argmax(used[:, ::-1], axis=1) - 1
+    row = jnp.cumsum(kept, axis=1) - 1
+    return kept[..., None] & (row[..., None] >= taps)
+
+
+class Coefficients(eqx.Module):
+    """Taps of the noise filter that are estimated with the parameters, padded to few lengths.
+
+    Coefficient c stands in row `row` for the past of `column`, `lag` samples back; `there` is
+    False for padding. The residual is linear in them: their columns are the residual's own past.
+    """
+
+    row: Int[Array, " coefficients"]
+    column: Int[Array, " coefficients"]
+    lag: Int[Array, " coefficients"]
+    there: Bool[Array, " coefficients"]
+
+    @classmethod
+    def of(cls, orders: Sequence[int], full: bool) -> "Coefficients":
+        """The coefficients of filters of these orders, of full matrices of them if asked."""
+        n = len(orders)
+        places = [
+            (i, j, lag)
+            for i in range(n)
+            for j in (range(n) if full else (i,))
+            for lag in range(1, orders[i] + 1)
+        ]
+        size = 8 * -(-len(places) // 8)
+        padded = np.array(places + [(0, 0, 0)] * (size - len(places)), int).reshape(size, 3).T
+        return cls(*(jnp.asarray(x) for x in padded), jnp.arange(size) < len(places))
+
+    def into(
+        self, noise: Float[Array, "..."], values: Float[Array, " coefficients"]
+    ) -> Float[Array, "..."]:
+        """The filter with these values for its coefficients."""
+        at = (self.row, self.lag) if noise.ndim == 2 else (self.row, self.column, self.lag)
+        return noise.at[at].add(jnp.where(self.there, values, 0.0))
+
+    def known(self, kept: Bool[Array, "recordings samples"]) -> Bool[Array, "recordings samples 1"]:
+        """Rows that need nothing from before the first sample, the same for all outputs."""
+        row = jnp.cumsum(kept, axis=1) - 1
+        return (kept & (row >= jnp.max(self.lag, initial=0)))[..., None]
+
+    def derivative(
+        self, raw: Float[Array, "recordings samples outputs"]
+    ) -> Float[Array, "recordings samples outputs coefficients"]:
+        """Of the filtered residual by the coefficients."""
+        at = jnp.arange(raw.shape[1])[:, None] - self.lag
+        past = raw[:, jnp.maximum(at, 0), self.column] * ((at >= 0) & self.there)
+        rows = self.row == jnp.arange(raw.shape[2])[:, None]
+        return past[:, :, None, :] * rows
 
 
 def filtered_by(
-    noise: Float[Array, "outputs taps"], x: Float[Array, "recordings samples outputs columns"]
+    noise: Float[Array, "..."], x: Float[Array, "recordings samples outputs columns"]
 ) -> Float[Array, "recordings samples outputs columns"]:
-    """A(z) x along the samples, for each output its own A; before the first sample all is zero."""
+    """A(z) x along the samples; before the first sample all is zero."""
+
+    def passed(lag, x):
+        a = noise[..., lag]
+        return a[:, None] * x if noise.ndim == 2 else jnp.einsum("ij,rkjc->rkic", a, x)
 
     def body(lag, total):
         earlier = jnp.roll(x, lag, axis=1)
         known = jnp.arange(x.shape[1]) >= lag
-        return total + noise[:, lag, None] * jnp.where(known[:, None, None], earlier, 0.0)
+        return total + passed(lag, jnp.where(known[:, None, None], earlier, 0.0))
 
     # White noise, the usual case, has no second tap: what is not there is not paid for.
-    used = jnp.max(jnp.where(noise != 0, jnp.arange(noise.shape[1]), 0))
-    return jax.lax.fori_loop(1, used + 1, body, noise[:, 0, None] * x)
+    used = jnp.max(jnp.where(noise != 0, jnp.arange(noise.shape[-1]), 0))
+    return jax.lax.fori_loop(1, used + 1, body, passed(0, x))
 
 
 def absorb_start(found: Sensitivity, free: Float[Array, " recordings"]) -> Sensitivity:
@@ -142,18 +253,68 @@ class Problem(eqx.Module):
 
     - `free`: one for recordings whose initial state is estimated, else zero.
     - `mesh`: devices that share the recordings; None for one.
+    - `coefficients`: of the noise filter, estimated after the loop's parameters in one vector;
+      None where the filter is given.
+    - `mix`: makes filtered outputs white and uncorrelated, `(outputs, outputs)`; None where the
+      weights do all of it.
     """
 
     loop: ClosedLoop
     batch: Batch
     weights: Float[Array, " outputs"]
-    noise: Float[Array, "outputs taps"]
+    noise: Float[Array, "outputs *taps"]
     free: Float[Array, " recordings"]
     lower: Float[Array, " parameters"]
     upper: Float[Array, " parameters"]
     signals: tuple[str, ...] = eqx.field(static=True)
     free_start: bool = eqx.field(static=True)
     mesh: Mesh | None = eqx.field(static=True, default=None)
+    coefficients: Coefficients | None = None
+    mix: Float[Array, "outputs outputs"] | None = None
+
+    def linearised(self, loop: ClosedLoop, batch: Batch, extra: Float[Array, " _"]) -> Sensitivity:
+        """Residual and derivatives, with one run of the simulation.
+
+        **Arguments:**
+
+        - `extra`: values of the noise filter's coefficients.
+        """
+
+        def part(loop: ClosedLoop, batch: Batch) -> Sensitivity:
+            return unfiltered(loop, batch, self.weights, self.signals, self.free_start)
+
+        plain = (
+            part(loop, batch)
+            if self.mesh is None
+            else shared_out(part, self.mesh, loop, batch)
+        )
+        return self.whitened(plain, extra)
+
+    def whitened(self, plain: Sensitivity, extra: Float[Array, " _"]) -> Sensitivity:
+        """The unfiltered residual through the noise filter, with the coefficients' derivatives."""
+        kept = self.batch.kept
+        if self.coefficients is None:
+            known = known_rows(self.noise, kept)
+            found = through_filter(plain, self.noise, known)
+        else:
+            known = self.coefficients.known(kept)
+            noise = self.coefficients.into(self.noise, extra)
+            found = through_filter(plain, noise, known)
+            past = self.coefficients.derivative(plain.raw) * known[..., None]
+            wide = jnp.concatenate([found.jacobian, past], axis=-1)
+            found = dataclasses.replace(found, jacobian=wide)
+        return found if self.mix is None else mixed(found, self.mix)
+
+
+def mixed(found: Sensitivity, mix: Float[Array, "outputs outputs"]) -> Sensitivity:
+    """Filtered residual and derivatives with outputs combined by a matrix."""
+    start = None if found.start is None else jnp.einsum("ij,rkja->rkia", mix, found.start)
+    return Sensitivity(
+        found.raw,
+        jnp.einsum("ij,rkj->rki", mix, found.residual),
+        jnp.einsum("ij,rkjp->rkip", mix, found.jacobian),
+        start,
+    )
 
 
 def linearise(
@@ -177,18 +338,21 @@ def _linearise(
     theta: Float[Array, " parameters"],
     start: Float[Array, "recordings initials"],
 ) -> Point:
-    n = problem.loop.joints
-    loop = problem.loop.with_theta(theta)
+    n, own = problem.loop.joints, problem.loop.theta.shape[0]
+    loop = problem.loop.with_theta(theta[:own])
     batch = dataclasses.replace(problem.batch, q0=start[:, :n], v0=start[:, n:])
+    found = problem.linearised(loop, batch, theta[own:])
+    return products(problem, theta, start, found)
 
-    def part(loop: ClosedLoop, batch: Batch) -> Sensitivity:
-        free_start, signals = problem.free_start, problem.signals
-        return sensitivity(loop, batch, problem.weights, problem.noise, signals, free_start)
 
-    if problem.mesh is None:
-        found = part(loop, batch)
-    else:
-        found = shared_out(part, problem.mesh, loop, batch)
+def products(
+    problem: Problem,
+    theta: Float[Array, " parameters"],
+    start: Float[Array, "recordings initials"],
+    found: Sensitivity,
+) -> Point:
+    """What a step needs of a linearisation."""
+    loop = problem.loop.with_theta(theta[: problem.loop.theta.shape[0]])
     count, p = start.shape[0], theta.shape[0]
     r = found.residual.reshape(count, -1)
     j = found.jacobian.reshape(count, -1, p)

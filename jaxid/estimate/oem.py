@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from ..control import OpenLoop
 from ..errors import FitError, JaxidError
 from ..loop import ClosedLoop
-from ..noise import ARFilter, fit_ar
+from ..noise import ARFilter, Noise, VectorAR
 from ..parameters import Bounds
 from ..progress import working
 from ..recording import Recording, Recordings
@@ -28,13 +28,13 @@ from ..simulate import (
     simulate,
     with_substeps,
 )
-from ._base import AbstractMethod, Fit, Status, determined_covariance, relative_errors
-from ._least_squares import Minimum, Problem, Sensitivity, absorb_start, minimise
+from ._base import AbstractMethod, Fit, Status, relative_errors
+from ._least_squares import Minimum, Problem, Sensitivity, minimise
+from .deviations import SAID, Deviations, Optimum, covariance_of
 from .didim import DIDIM, physical
 from .idim import IDIM
 
 Output = Literal["torque", "position", "both"]
-Deviations = Literal["sandwich", "white"]
 
 
 class OEM(AbstractMethod):
@@ -52,7 +52,8 @@ class OEM(AbstractMethod):
       `"auto"` estimates those of recordings that do not start at rest.
     - `window`: length in s of pieces simulated on their own, each from its own estimated state
       (multiple shooting); None for whole recordings.
-    - `deviations`: `"sandwich"` for coloured residuals, `"white"` for (A.1) as in the paper.
+    - `deviations`: `"sandwich"` for coloured residuals, `"white"` for (A.1), `"paper"` for what
+      the paper prints.
     - `tolerance`: it stops when a step is shorter than this many standard deviations.
     - `max_steps`: largest number of iterations, those for better weights included.
     - `max_seconds`: longest time, looked at between iterations; what is found until then is given.
@@ -183,10 +184,16 @@ class _Done(eqx.Module):
     pieces: tuple[Recording, ...]
     batch: Batch
     weights: Float[Array, " outputs"]
-    free: Float[Array, " recordings"]
     minimum: Minimum
+    problem: Problem
     signals: tuple[str, ...] = eqx.field(static=True)
     iterations: int = eqx.field(static=True)
+
+    @property
+    def optimum(self) -> Optimum:
+        """Where it ended, for whatever asks how sure that is."""
+        point = self.minimum.point
+        return Optimum(self.problem, point.theta, point.start)
 
 
 def pieces_of(recordings: Recordings, window: float | None) -> tuple[Recording, ...]:
@@ -247,7 +254,7 @@ def _converge(
     loop: ClosedLoop,
     recordings: Recordings,
     say: Callable[[str], None],
-    filters: Sequence[ARFilter] | None = None,
+    filters: Noise = None,
     deadline: float = math.inf,
 ) -> _Done:
     """Minimises, then again with the weights and initial states that follow, until they settle.
@@ -262,16 +269,17 @@ def _converge(
     batch = prepare(loop, pieces)
     free = jnp.asarray(_free_starts(method, pieces, batch))
     weights = jnp.asarray(_first_weights(loop, pieces, signals))
-    noise = jnp.asarray(_taps(filters, weights.shape[0]))
     bounds = Bounds.of(loop.free_parameters)
     start = jnp.asarray(np.concatenate([batch.q0, batch.v0], axis=1))
-    total, minimum = 0, None
+    total, minimum, problem = 0, None, None
     # Until the weights are known, a rough minimum is enough.
     worth = 1e-2
     for _ in range(20):
         within = bounds.lower, bounds.upper
+        noise = jnp.asarray(_taps(filters, weights))
         kinds = signals, bool(free.any()), method.mesh
-        problem = Problem(loop, batch, weights, noise, free, *within, *kinds)
+        mix = _mix(filters, weights)
+        problem = Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix)
         left = method.max_steps - total
         minimum = minimise(
             problem, loop.theta, start, method.tolerance, worth, left, say, deadline
@@ -289,17 +297,29 @@ def _converge(
             break
         weights, worth = new, 1e-4 if settled else worth
     assert minimum is not None
-    return _Done(loop, pieces, batch, weights, free, minimum, signals, total)
+    assert problem is not None
+    return _Done(loop, pieces, batch, problem.weights, minimum, problem, signals, total)
 
 
-def _taps(filters: Sequence[ARFilter] | None, outputs: int) -> Float[np.ndarray, "outputs taps"]:
-    """Polynomials of noise filters, padded so that few lengths ever get compiled."""
+def _taps(filters: Noise, weights: Float[Array, " outputs"]) -> Float[np.ndarray, "..."]:
+    """Noise filters of the weighted outputs, padded so that few lengths ever get compiled."""
+    w = np.asarray(weights)
+    if isinstance(filters, VectorAR):
+        scale = np.outer(w, 1 / w)[..., None]
+        return scale * filters.taps(16 * (filters.order // 16 + 1))
     longest = max((f.order for f in filters or ()), default=0)
-    taps = np.zeros((outputs, 16 * (longest // 16 + 1)))
-    taps[:, 0] = 1.0
-    for row, filt in zip(taps, filters or (), strict=False):
-        row[: filt.order + 1] = filt.polynomial
-    return taps
+    size = 16 * (longest // 16 + 1)
+    white = ARFilter(np.zeros(0), 1.0)
+    return np.stack([f.taps(size) for f in filters or [white] * len(w)])
+
+
+def _mix(filters: Noise, weights: Float[Array, " outputs"]) -> Float[Array, "..."] | None:
+    """What makes the innovations of a vector filter white; other filters' are taken for it."""
+    if not isinstance(filters, VectorAR):
+        return None
+    w = np.asarray(weights)
+    root = np.linalg.cholesky(filters.covariance * np.outer(w, w))
+    return jnp.asarray(np.linalg.inv(root))
 
 
 def _new_weights(
@@ -340,21 +360,16 @@ def _report(
     recordings: Recordings,
     seconds: float,
     shown: AbstractMethod | None = None,
-    how: str | None = None,
+    noise: Noise = None,
+    rounds: int = 0,
 ) -> Fit:
-    """The `Fit`; `shown` and `how` name a method that builds on this one, and its deviations."""
-    found, mask = absorb_start(done.minimum.point.found, done.free), np.asarray(done.batch.kept)
-    names = done.loop.names
-    residuals = [np.asarray(found.residual)[k][mask[k]] for k in range(len(done.pieces))]
-    jacobians = [np.asarray(found.jacobian)[k][mask[k]] for k in range(len(done.pieces))]
-    if done.minimum.status is Status.diverged:
-        p = len(names)
-        covariance, lost = np.full((p, p), np.inf), ()
-    else:
-        information = sum(np.einsum("kop,koq->pq", j, j) for j in jacobians)
-        scales = np.asarray(Bounds.of(done.loop.free_parameters).scale)
-        meat = score_covariance(residuals, jacobians) if method.deviations == "sandwich" else None
-        covariance, lost = determined_covariance(np.asarray(information), names, scales, meat)
+    """The `Fit`; `shown` names a method that builds on this one, `noise` the filters it found."""
+    found, mask = done.minimum.point.found, np.asarray(done.batch.kept)
+    p = len(done.loop.names)
+    covariance, lost, said = np.full((p, p), np.inf), (), ""
+    if done.minimum.status is not Status.diverged:
+        covariance, lost = covariance_of(done.optimum, method.deviations, noise, found)
+        said = SAID[method.deviations]
     raw, weights = np.asarray(found.raw), np.asarray(done.weights)
     unweighted = [raw[k][mask[k]] / weights for k in range(len(done.pieces))]
     n = done.loop.joints
@@ -362,8 +377,6 @@ def _report(
     measured = compared(done.loop, done.pieces, measured)
     errors = [r[:, :n] for r in unweighted]
     measured, errors = _rejoin(recordings, done.pieces, measured, errors)
-    notes = _at_bounds(done.loop)
-    said = {"sandwich": "sandwich estimate for coloured residuals", "white": "equation (A.1)"}
     return Fit(
         done.loop,
         recordings,
@@ -375,9 +388,12 @@ def _report(
         done.iterations,
         0,
         seconds,
-        how or said[method.deviations],
+        said,
         lost,
-        tuple(notes),
+        tuple(_at_bounds(done.loop)),
+        noise if noise is None or isinstance(noise, VectorAR) else tuple(noise),
+        rounds,
+        done.optimum,
     )
 
 
@@ -405,35 +421,3 @@ def _at_bounds(loop: ClosedLoop) -> list[str]:
             if np.isfinite(bound) and np.any(np.abs(value - bound) < 2e-3 * p.declaration.scale):
                 notes.append(f"{p.name} is at its {word} bound, {bound:g} {loop.unit(p)}")
     return notes
-
-
-def score_covariance(
-    residuals: Sequence[Float[np.ndarray, "_samples outputs"]],
-    jacobians: Sequence[Float[np.ndarray, "_samples outputs parameters"]],
-) -> Float[np.ndarray, "parameters parameters"]:
-    """Covariance of J'r where residuals are coloured: their spectrum, weighed by J's.
-
-    Each output's residuals are taken as one autoregressive process over all recordings, with the
-    order by AIC, but stronger in one recording than in another: noise that grows with the torque
-    is strongest where the derivatives are largest too. Outputs are taken as uncorrelated.
-    """
-    outputs, p = jacobians[0].shape[1:]
-    meat = np.zeros((p, p))
-    for o in range(outputs):
-        series = [r[:, o] - r[:, o].mean() for r in residuals]
-        strengths = [float(np.std(x)) or 1.0 for x in series]
-        # Residuals that passed a low-pass have next to no power above it, and a filter fitted to
-        # them ends in rounding: a white floor 100 dB down keeps it stable and changes nothing else.
-        floor = np.random.default_rng(0)
-        noise = fit_ar(
-            [
-                x / strength + 1e-5 * floor.standard_normal(len(x))
-                for x, strength in zip(series, strengths, strict=True)
-            ]
-        )
-        for j, strength in zip(jacobians, strengths, strict=True):
-            size = 1 << int(np.ceil(np.log2(2 * j.shape[0])))
-            wave = np.fft.fft(j[:, o], size, axis=0)
-            power = strength**2 * noise.spectrum(size)[:, None]
-            meat += np.real(wave.conj().T @ (power * wave)) / size
-    return meat

@@ -1,20 +1,40 @@
 """Separable prediction error: the output error through the inverse of an estimated noise filter."""
 
+import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
-from typing import Literal
+from collections.abc import Callable, Iterator, Sequence
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
+from ..errors import NoiseError
 from ..loop import ClosedLoop
-from ..noise import ARFilter, fit_ar
+from ..noise import (
+    ARFilter,
+    Criterion,
+    Noise,
+    VectorAR,
+    check_series,
+    fit_ar,
+    fit_var,
+    innovations,
+)
 from ..progress import working
 from ..recording import Recordings
 from ..simulate import with_substeps
 from ._base import AbstractMethod, Fit, Status
+from .deviations import Deviations
 from .oem import OEM, _converge, _Done, _report, start_values
+
+
+class Order(NamedTuple):
+    """How the orders of noise filters are chosen; see `SeparablePEM`."""
+
+    criterion: Criterion
+    highest: int
+    white: float | None
 
 
 class SeparablePEM(AbstractMethod):
@@ -27,20 +47,39 @@ class SeparablePEM(AbstractMethod):
 
     - `oem`: output, start, initial states and bounds are those of this method.
     - `filters`: noise filters to use as given, one for each output; None to estimate them.
-    - `criterion`: by which the order of the filters is chosen, up to `highest`.
+    - `criterion`: `"aic"`, `"aicc"` or `"bic"`, by which the orders are chosen over 0..`highest`.
+    - `white`: significance at which Ljung and Box's test refuses an order whose innovations are
+      not white (CAPTAIN's `aic` has such a condition, Young 2011); None for the criterion alone.
+    - `orders`: of the filters, one for each output, in place of a choice.
+    - `coupled`: one filter for all joints together, each driven by the past of all.
+    - `first_step`: `"filtered"` for parameters from the filtered error; `"plain"` for the paper's
+      own variant, whose parameters ignore the filter and stay those of output error.
+    - `deviations`: `"white"` for (A.1), `"sandwich"`, `"paper"`; by default the first where
+      parameters come from the filtered error, else the second.
     - `tolerance`: relative change of the prediction error's variance at which it stops.
     - `rounds`: largest number of alternations.
+
+    **Raises:** `NoiseError` where the residuals allow no such filter; its `fit` is what there was.
     """
 
     oem: OEM = OEM()
-    filters: tuple[ARFilter, ...] | None = None
-    criterion: Literal["aic", "aicc", "bic"] = eqx.field(static=True, default="aic")
+    filters: tuple[ARFilter, ...] | VectorAR | None = None
+    criterion: Criterion = eqx.field(static=True, default="aic")
     highest: int = eqx.field(static=True, default=50)
+    white: float | None = eqx.field(static=True, default=0.05)
+    orders: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    coupled: bool = eqx.field(static=True, default=False)
+    first_step: Literal["filtered", "plain"] = eqx.field(static=True, default="filtered")
+    deviations: Deviations | None = eqx.field(static=True, default=None)
     tolerance: float = 1e-3
     rounds: int = eqx.field(static=True, default=10)
 
     def __repr__(self) -> str:
-        return f"SeparablePEM({self.criterion})"
+        said = self.criterion if self.orders is None else f"orders={self.orders}"
+        given = "filters given" if self.filters is not None else said
+        more = ", coupled" if self.coupled else ""
+        plain = ", first_step='plain'" if self.first_step == "plain" else ""
+        return f"SeparablePEM({given}{more}{plain})"
 
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
         """Estimates the loop's free parameters; called by `jaxid.fit`."""
@@ -48,10 +87,11 @@ class SeparablePEM(AbstractMethod):
         with working(f"SeparablePEM of {loop.name}", self.oem.progress) as say:
             loop = with_substeps(start_values(loop, recordings, self.oem.start, say), recordings)
             deadline = started + self.oem.max_seconds
-            done = self._alternate(loop, recordings, say, deadline)
-        how = "equation (A.1) with the gradient of the filtered error"
-        method = dataclasses.replace(self.oem, deviations="white")
-        return _report(method, done, recordings, time.perf_counter() - started, self, how)
+            done, noise, rounds = self._alternate(loop, recordings, say, deadline)
+        kind = self.deviations or ("white" if self.first_step == "filtered" else "sandwich")
+        method = dataclasses.replace(self.oem, deviations=kind)
+        seconds = time.perf_counter() - started
+        return _report(method, done, recordings, seconds, self, noise, rounds)
 
     def _alternate(
         self,
@@ -59,31 +99,87 @@ class SeparablePEM(AbstractMethod):
         recordings: Recordings,
         say: Callable[[str], None],
         deadline: float,
-    ) -> _Done:
+    ) -> tuple[_Done, Noise, int]:
+        """Where it ended, with which filters, after how many alternations."""
         if self.filters is not None:
-            return _converge(self.oem, loop, recordings, say, self.filters, deadline)
+            done = _converge(self.oem, loop, recordings, say, self.filters, deadline)
+            return done, self.filters, 0
         done = _converge(self.oem, loop, recordings, say, deadline=deadline)
+        noise: Noise = None
         before = np.inf
-        for _ in range(self.rounds):
+        for k in range(1, self.rounds + 1):
             if done.minimum.status in (Status.diverged, Status.max_seconds):
-                break
-            filters = noise_filters(done, self.criterion, self.highest)
-            done = _converge(self.oem, done.loop, recordings, say, filters, deadline)
-            spread = float(np.sum(np.log(1 / np.asarray(done.weights))))
+                return done, noise, k - 1
+            with keeping(done, self.oem, recordings):
+                order = Order(self.criterion, self.highest, self.white)
+                noise = noise_filters(done, order, self.orders, self.coupled)
+            if self.first_step == "filtered":
+                done = _converge(self.oem, done.loop, recordings, say, noise, deadline)
+            spread = prediction_spread(done, noise)
             if abs(before - spread) < self.tolerance:
-                break
+                return done, noise, k
             before = spread
-        return done
+        return done, noise, self.rounds
+
+
+@contextlib.contextmanager
+def keeping(done: _Done, method: OEM, recordings: Recordings) -> Iterator[None]:
+    """Hands the fit so far on with a `NoiseError`."""
+    try:
+        yield
+    except NoiseError as error:
+        error.fit = _report(method, done, recordings, 0.0)
+        raise
+
+
+def residual_series(done: _Done) -> list[np.ndarray]:
+    """Measured less simulated, `(samples, outputs)` for each recording, in their own units."""
+    raw = np.asarray(done.minimum.point.found.raw) / np.asarray(done.weights)
+    mask = np.asarray(done.batch.kept)
+    return [row[there] for row, there in zip(raw, mask, strict=True)]
 
 
 def noise_filters(
-    done: _Done, criterion: Literal["aic", "aicc", "bic"], highest: int
-) -> Sequence[ARFilter]:
-    """The AR filter of each output's residuals, over all recordings."""
-    raw = np.asarray(done.minimum.point.found.raw) / np.asarray(done.weights)
-    mask = np.asarray(done.batch.kept)
+    done: _Done, order: Order, orders: Sequence[int] | None = None, coupled: bool = False
+) -> tuple[ARFilter, ...] | VectorAR:
+    """The AR filter of each output's residuals, or of all together, over all recordings.
+
+    **Raises:** `NoiseError` where the residuals do not allow it.
+    """
+    residuals = residual_series(done)
+    outputs = residuals[0].shape[1]
+    if orders is not None and len(orders) != outputs:
+        raise NoiseError(f"{len(orders)} orders are given for {outputs} outputs: give one for each")
+    if coupled:
+        given = None if orders is None else max(orders)
+        return fit_var(residuals, given, highest=order.highest, criterion=order.criterion)
     filters = []
-    for output in range(raw.shape[2]):
-        series = [row[there, output] for row, there in zip(raw, mask, strict=True)]
-        filters.append(fit_ar(series, criterion=criterion, highest=highest))
+    for output in range(outputs):
+        series = [x[:, output] for x in residuals]
+        given = None if orders is None else orders[output]
+        check_series(series, given or 0, output_name(done, output))
+        filters.append(
+            fit_ar(
+                series,
+                given,
+                highest=order.highest,
+                criterion=order.criterion,
+                white=order.white,
+            )
+        )
     return tuple(filters)
+
+
+def output_name(done: _Done, output: int) -> str:
+    """How messages call an output."""
+    signal, joint = divmod(output, done.loop.joints)
+    what = {"tau": "torque", "q": "position"}[done.signals[signal]]
+    return f"joint {joint + 1}'s {what}"
+
+
+def prediction_spread(done: _Done, noise: Noise) -> float:
+    """Logarithm of the determinant of the prediction error's covariance."""
+    white = [innovations(x, noise) for x in residual_series(done)]
+    together = np.concatenate(white)
+    together = together[np.any(together != 0, axis=1)]
+    return float(np.sum(np.log(np.mean(together**2, axis=0))))

@@ -5,7 +5,14 @@ from typing import Literal
 
 import equinox as eqx
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
+from scipy import signal
+
+from ..errors import NoiseError
+from .whiteness import ljung_box
+
+Criterion = Literal["aic", "aicc", "bic"]
 
 
 class ARFilter(eqx.Module):
@@ -13,6 +20,23 @@ class ARFilter(eqx.Module):
 
     coefficients: Float[np.ndarray, " order"]
     variance: float
+
+    @classmethod
+    def from_reflection(
+        cls, reflection: Float[np.ndarray, " order"], variance: float = 1.0
+    ) -> "ARFilter":
+        """The filter of reflection coefficients; stable, since they are below one (Levinson 1947).
+
+        **Raises:** `NoiseError` if one is not.
+        """
+        reflection = np.asarray(reflection, dtype=float)
+        if not np.all(np.abs(reflection) < 1):
+            raise NoiseError("a reflection coefficient of a stable filter is between -1 and 1")
+        a = np.ones(1)
+        for k in reflection:
+            a = np.append(a, 0.0)
+            a = a + k * a[::-1]
+        return cls(a[1:], float(variance))
 
     @property
     def order(self) -> int:
@@ -24,16 +48,108 @@ class ARFilter(eqx.Module):
         """1, a1, a2, …"""
         return np.concatenate([[1.0], self.coefficients])
 
+    @property
+    def reflection(self) -> Float[np.ndarray, " order"]:
+        """Reflection coefficients; the filter is stable where all are between -1 and 1."""
+        a, found = self.polynomial, []
+        while len(a) > 1:
+            k = a[-1]
+            found.append(k)
+            if abs(k) >= 1:
+                # No step down from here: the filter is unstable, whatever the others are.
+                found += [np.inf] * (len(a) - 2)
+                break
+            a = ((a - k * a[::-1]) / (1 - k**2))[:-1]
+        return np.array(found[::-1])
+
+    @property
+    def stable(self) -> bool:
+        """Whether noise from this filter stays bounded."""
+        return bool(np.all(np.abs(self.reflection) < 1))
+
+    @property
+    def gain(self) -> float:
+        """Variance of the coloured noise over that of e; infinite where unstable."""
+        reflection = self.reflection
+        if not np.all(np.abs(reflection) < 1):
+            return np.inf
+        return float(1 / np.prod(1 - reflection**2))
+
     def spectrum(self, size: int) -> Float[np.ndarray, " size"]:
         """Power at the `size` frequencies of a discrete Fourier transform."""
         return self.variance / np.abs(np.fft.fft(self.polynomial, size)) ** 2
 
     def whiten(self, x: Float[np.ndarray, "samples *axes"]) -> Float[np.ndarray, "samples *axes"]:
         """A(z) x along the first axis; what came before the first sample counts as zero."""
-        white = np.array(x, dtype=float)
-        for k, a in enumerate(self.coefficients, start=1):
-            white[k:] += a * x[:-k]
-        return white
+        return np.asarray(signal.lfilter(self.polynomial, [1.0], np.asarray(x, float), axis=0))
+
+    def stabilised(self) -> "ARFilter":
+        """The stable filter of the same spectrum: poles outside the unit circle turned inside."""
+        if self.stable:
+            return self
+        poles = np.roots(self.polynomial)
+        outside = np.abs(poles) >= 1
+        inside = np.where(outside, 1 / np.conj(poles), poles)
+        # On the circle itself noise would grow for ever; a thousandth inside it does not.
+        inside = inside * np.minimum(1.0, 0.999 / np.maximum(np.abs(inside), 1e-12))
+        variance = self.variance / float(np.prod(np.abs(poles[outside]) ** 2))
+        return ARFilter(np.real(np.poly(inside))[1:], variance)
+
+    def simulate(
+        self, shape: tuple[int, ...], rng: np.random.Generator
+    ) -> Float[np.ndarray, "*shape"]:
+        """Stationary noise from the first sample on, along the last axis of `shape`."""
+        filt = self.stabilised()
+        slowest = max(np.abs(np.roots(filt.polynomial)), default=0.0)
+        # What the first samples remember of a start at zero has sunk to a ten-thousandth.
+        settle = min(50_000, int(np.ceil(np.log(1e-4) / np.log(min(slowest, 0.9999))))) + 1
+        lead = settle if filt.order else 0
+        white = rng.standard_normal((*shape[:-1], shape[-1] + lead))
+        noise = signal.lfilter([np.sqrt(filt.variance)], filt.polynomial, white, axis=-1)
+        return np.asarray(noise)[..., lead:]
+
+    def taps(self, size: int) -> Float[np.ndarray, " size"]:
+        """The polynomial padded with zeros."""
+        return np.pad(self.polynomial, (0, size - self.order - 1))
+
+
+def check_series(series: Sequence[Float[np.ndarray, " _"]], order: int, what: str) -> None:
+    """Refuses residuals that no noise filter of an order can be estimated from.
+
+    **Arguments:**
+
+    - `series`: residuals, one array for each recording.
+    - `order`: the highest order asked for.
+    - `what`: whose residuals, as a reader knows it.
+
+    **Raises:** `NoiseError`.
+    """
+    if order < 0:
+        raise NoiseError(f"the noise filter of {what} has order {order}: give 0 or more")
+    for k, x in enumerate(series, start=1):
+        if not np.isfinite(x).all():
+            raise NoiseError(
+                f"the residual of {what} in recording {k} is not finite: the simulation failed "
+                "there, so estimate the parameters first"
+            )
+    shortest = min(len(x) for x in series)
+    if shortest <= order + 1:
+        raise NoiseError(
+            f"a recording of {shortest} samples is shorter than the noise filter of {what}, whose "
+            f"order is {order}: leave it out, or lower the order"
+        )
+    total = sum(len(x) for x in series)
+    if total - order * len(series) < 3 * (order + 1):
+        raise NoiseError(
+            f"{total} samples of {what} do not determine a noise filter of order {order}, which "
+            "wants four for each coefficient: lower the order or record longer"
+        )
+    swing = max(float(np.ptp(x)) for x in series)
+    if swing <= 1e-12 * max(float(np.abs(x).max()) for x in series):
+        raise NoiseError(
+            f"the residual of {what} is constant, so there is no noise to model: use OEM, or see "
+            "whether its torque was recorded at all"
+        )
 
 
 def fit_ar(
@@ -41,7 +157,8 @@ def fit_ar(
     order: int | None = None,
     *,
     highest: int = 50,
-    criterion: Literal["aic", "aicc", "bic"] = "aic",
+    criterion: Criterion = "aic",
+    white: float | None = None,
 ) -> ARFilter:
     """The AR filter of one joint's residuals over several recordings, by Burg's method.
 
@@ -52,46 +169,107 @@ def fit_ar(
 
     - `series`: residuals, `(samples,)` each.
     - `order`: number of coefficients; None to choose it by `criterion` over 0..`highest`.
+    - `white`: significance at which Ljung and Box's test of the innovations refuses an order, as
+      `orders` has it; None not to ask.
+
+    **Raises:** `NoiseError` for a given order that the data do not allow.
     """
-    count = sum(len(x) for x in series)
+    if order is not None:
+        check_series(series, order, "this series")
     most = highest if order is None else order
-    most = max(0, min(most, min(len(x) for x in series) // 3))
-    coefficients, variances = _burg(series, most)
-    if variances[0] <= 0:
+    if order is None:
+        most = max(0, min(most, min(len(x) for x in series) // 3))
+    burg = Burg.of(series, most)
+    if burg.variances[0] <= 0:
         return ARFilter(np.zeros(0), 0.0)
     if order is None:
-        k = np.arange(most + 1)
-        penalty = {
-            "aic": 2.0 * (k + 1),
-            "aicc": 2.0 * (k + 1) * count / np.maximum(count - k - 2, 1),
-            "bic": np.log(count) * (k + 1),
-        }[criterion]
-        order = int(np.argmin(count * np.log(variances) + penalty))
-    order = min(order, most)
-    return ARFilter(coefficients[order], float(variances[order]))
+        table = burg.orders(white is not None)
+        order = choose(table, criterion, white)
+    return ARFilter(burg.coefficients[order], float(burg.variances[order]))
 
 
-def _burg(
-    series: Sequence[Float[np.ndarray, " _"]], most: int
-) -> tuple[list[np.ndarray], Float[np.ndarray, " orders"]]:
-    """Coefficients and innovation variances of every order, pooled over series (Burg 1975).
+def orders(
+    series: Sequence[Float[np.ndarray, " _"]], highest: int = 50, lags: int = 38
+) -> pd.DataFrame:
+    """Innovation variance, AIC, AICc, BIC and whiteness of every order up to `highest`.
+
+    **Arguments:**
+
+    - `series`: residuals of one joint, `(samples,)` for each recording.
+    - `lags`: of Ljung and Box's test; at least twenty beyond each order.
+    """
+    check_series(series, 0, "this series")
+    most = max(0, min(highest, min(len(x) for x in series) // 3))
+    return Burg.of(series, most).orders(True, lags)
+
+
+def choose(table: pd.DataFrame, criterion: Criterion, white: float | None = None) -> int:
+    """The order with the least criterion, among those whose innovations pass for white if any do.
+
+    (As CAPTAIN's `aic` does, Young 2011.)
+
+    **Arguments:**
+
+    - `table`: from `orders`.
+    - `white`: significance of the test; None to ask for the criterion alone.
+    """
+    if white is not None:
+        passing = table[table["ljung_box_p"] > white]
+        table = passing if len(passing) else table
+    return int(table[criterion].idxmin())
+
+
+class Burg(eqx.Module):
+    """Filters of every order, pooled over series (Burg 1975).
 
     Yule and Walker's equations have a bias that near the unit circle makes the variance several
     times too large; no library pools several series.
     """
-    forward = [np.asarray(x, dtype=float) for x in series]
-    backward = list(forward)
-    a = np.ones(1)
-    variances = [sum(float(x @ x) for x in forward) / sum(len(x) for x in forward)]
-    found = [np.zeros(0)]
-    for _ in range(most):
-        pairs = [(f[1:], b[:-1]) for f, b in zip(forward, backward, strict=True)]
-        power = sum(float(f @ f + b @ b) for f, b in pairs)
-        k = -2 * sum(float(f @ b) for f, b in pairs) / power if power > 0 else 0.0
-        forward = [f + k * b for f, b in pairs]
-        backward = [b + k * f for f, b in pairs]
-        a = np.append(a, 0.0)
-        a = a + k * a[::-1]
-        found.append(a[1:])
-        variances.append(variances[-1] * (1 - k**2))
-    return found, np.array([variances[0], *np.maximum(variances[1:], 1e-300)])
+
+    coefficients: list[np.ndarray]
+    variances: Float[np.ndarray, " orders"]
+    innovations: list[list[np.ndarray]]
+    count: int
+
+    @classmethod
+    def of(cls, series: Sequence[Float[np.ndarray, " _"]], most: int) -> "Burg":
+        """Orders 0..`most`."""
+        forward = [np.asarray(x, dtype=float) for x in series]
+        backward = list(forward)
+        a = np.ones(1)
+        count = sum(len(x) for x in forward)
+        variances = [sum(float(x @ x) for x in forward) / count]
+        found, innovations = [np.zeros(0)], [list(forward)]
+        for _ in range(most):
+            pairs = [(f[1:], b[:-1]) for f, b in zip(forward, backward, strict=True)]
+            power = sum(float(f @ f + b @ b) for f, b in pairs)
+            k = -2 * sum(float(f @ b) for f, b in pairs) / power if power > 0 else 0.0
+            forward = [f + k * b for f, b in pairs]
+            backward = [b + k * f for f, b in pairs]
+            a = np.append(a, 0.0)
+            a = a + k * a[::-1]
+            found.append(a[1:])
+            innovations.append(forward)
+            variances.append(variances[-1] * (1 - k**2))
+        floored = np.array([variances[0], *np.maximum(variances[1:], 1e-300)])
+        return cls(found, floored, innovations, count)
+
+    def orders(self, tested: bool, lags: int = 38) -> pd.DataFrame:
+        """One row an order; whiteness only where `tested`, for it takes longer than the rest."""
+        k = np.arange(len(self.variances))
+        level = self.count * np.log(self.variances)
+        table = pd.DataFrame(
+            {
+                "variance": self.variances,
+                "aic": level + 2.0 * (k + 1),
+                "aicc": level + 2.0 * (k + 1) * self.count / np.maximum(self.count - k - 2, 1),
+                "bic": level + np.log(self.count) * (k + 1),
+            },
+            index=pd.Index(k, name="order"),
+        )
+        if tested:
+            table["ljung_box_p"] = [
+                ljung_box(e, max(lags, order + 20), order).p_value
+                for order, e in enumerate(self.innovations)
+            ]
+        return table

@@ -2,8 +2,10 @@
 
 from collections.abc import Sequence
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy import stats
 
 
 def autocovariance(
@@ -38,3 +40,38 @@ def autocorrelation(
     bound = 2 / np.sqrt(sum(len(x) for x in series))
     level = covariance[0] if covariance[0] > 0 else 1.0
     return covariance / level, float(bound)
+
+
+class LjungBox(eqx.Module):
+    """A test of whiteness: statistic, degrees of freedom, and the chance of as much by noise."""
+
+    statistic: float
+    freedom: int
+    p_value: float
+
+
+def ljung_box(
+    series: Sequence[Float[np.ndarray, " _"]], lags: int = 38, fitted: int = 0
+) -> LjungBox:
+    """Whether residuals are white, over several recordings at once (Ljung and Box 1978).
+
+    statsmodels has the test for one series; pooled, each lag counts the pairs that recordings
+    hold, none across their ends.
+
+    **Arguments:**
+
+    - `series`: residuals with mean zero, `(samples,)` each.
+    - `lags`: how many.
+    - `fitted`: coefficients that were estimated from them.
+    """
+    covariance = autocovariance(series, lags)
+    total = sum(len(x) for x in series)
+    if covariance[0] <= 0:
+        return LjungBox(0.0, max(lags - fitted, 1), 1.0)
+    at = np.arange(1, lags + 1)
+    pairs = np.array([sum(max(len(x) - k, 0) for x in series) for k in at])
+    correlation = covariance[1:] / covariance[0]
+    weight = np.divide(total * (total + 2.0), pairs, where=pairs > 0, out=0.0 * at)
+    statistic = float(np.sum(weight * correlation**2))
+    freedom = max(lags - fitted, 1)
+    return LjungBox(statistic, freedom, float(stats.chi2.sf(statistic, freedom)))

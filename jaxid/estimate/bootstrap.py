@@ -1,0 +1,100 @@
+"""Parametric bootstrap: fits of what the fitted model and its noise would have recorded."""
+
+import dataclasses
+
+import equinox as eqx
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float
+
+from ..errors import FitError
+from ..noise import ARFilter, VectorAR, fit_ar
+from ._base import Fit
+from .deviations import optimum_of
+from .refit import drawn_noise, redrawn, refit_signals
+
+
+class Bootstrap(eqx.Module):
+    """Estimates from recordings drawn anew, `(draws, parameters)`, beside the fit they belong to.
+
+    `settled` says which draws ended within a tenth of a deviation of their minimum.
+    """
+
+    fit: Fit
+    theta: Float[np.ndarray, "draws parameters"]
+    settled: Bool[np.ndarray, " draws"]
+
+    @property
+    def std(self) -> Float[np.ndarray, " parameters"]:
+        """Standard deviation over the draws."""
+        return self.theta.std(axis=0, ddof=1)
+
+    def interval(self, level: float = 0.95) -> Float[np.ndarray, "parameters 2"]:
+        """Basic bootstrap intervals: draws scatter about the fit as the fit about the truth."""
+        tail = (1 - level) / 2
+        low, high = np.quantile(self.theta, [tail, 1 - tail], axis=0)
+        return np.stack([2 * self.fit.theta - high, 2 * self.fit.theta - low], axis=1)
+
+    def table(self, level: float = 0.95) -> pd.DataFrame:
+        """Value, bias, deviation and interval of each parameter."""
+        low, high = self.interval(level).T
+        return pd.DataFrame(
+            {
+                "value": self.fit.theta,
+                "bias": self.theta.mean(axis=0) - self.fit.theta,
+                "std": self.std,
+                "low": low,
+                "high": high,
+            },
+            index=pd.Index(self.fit.names, name="parameter"),
+        )
+
+    def shown(self) -> Fit:
+        """The fit, showing these deviations."""
+        covariance = np.atleast_2d(np.cov(self.theta, rowvar=False))
+        said = f"parametric bootstrap of {len(self.theta)} draws"
+        return dataclasses.replace(self.fit, covariance=covariance, deviations=said)
+
+    def __repr__(self) -> str:
+        head = f"{len(self.theta)} draws, {int(self.settled.sum())} settled"
+        return f"{head}\n{self.table().to_string(float_format=lambda x: f'{x:.4g}')}"
+
+
+def bootstrap(fit: Fit, draws: int = 200, *, seed: int = 0) -> Bootstrap:
+    """Fits recordings that the fitted model would have given under noise drawn anew, vmapped.
+
+    Noise comes from the fit's filters, stationary and stable; a fit by `OEM`, which has none, gets
+    them from its residuals (Burg, AIC). Each draw is a few Gauss-Newton steps from the estimate;
+    for `SeparablePEM` with the filters of each draw estimated anew, for `JointPEM` with their
+    coefficients among the values.
+
+    **Arguments:**
+
+    - `fit`: by `OEM`, `SeparablePEM` or `JointPEM`.
+    - `draws`: how many.
+    - `seed`: of the noise.
+
+    **Raises:** `FitError` for a fit by regression, with `Tracking()`, or that did not succeed.
+    """
+    problem = optimum_of(fit, "bootstrap").problem
+    if not np.isfinite(fit.theta).all() or not np.isfinite(problem.weights).all():
+        raise FitError("a fit that diverged has no bootstrap: start it from other values")
+    noise = fit.noise
+    if noise is None:
+        noise = residual_filters(fit)
+    lengths = [len(r) for r in fit.residuals]
+    if len(lengths) != problem.batch.q.shape[0]:
+        raise FitError("bootstrap is for whole recordings: fit without window")
+    made = drawn_noise(noise, lengths, draws, np.random.default_rng(seed))
+    found = refit_signals(fit, redrawn(fit, made))
+    p = len(fit.names)
+    # The last step of a hundredth is squared: a tenth of a deviation.
+    return Bootstrap(fit, np.asarray(found.theta)[:, :p], np.asarray(found.last) < 1e-2)
+
+
+def residual_filters(fit: Fit) -> tuple[ARFilter, ...] | VectorAR:
+    """AR filters of a fit's residuals."""
+    series = [[r[:, j] - r[:, j].mean() for r in fit.residuals] for j in range(fit.loop.joints)]
+    if fit.optimum.problem.weights.shape[0] != fit.loop.joints:
+        raise FitError("bootstrap is for one output a joint: fit torque or position, not both")
+    return tuple(fit_ar(x) for x in series)

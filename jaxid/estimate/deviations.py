@@ -1,0 +1,225 @@
+"""How sure a least-squares estimate is: equation (A.1), a sandwich, and the paper's own numbers."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from ..errors import FitError
+from ..noise import Noise, fit_ar, innovations
+from ..parameters import Bounds
+from ._base import Fit, determined_covariance
+from ._least_squares import Problem, Sensitivity, absorb_start, linearise, unfiltered
+
+Deviations = Literal["sandwich", "white", "paper"]
+
+SAID = {
+    "sandwich": "sandwich estimate, right for whatever colour the residuals have",
+    "white": "equation (A.1) with the gradient of the filtered error, right if that error is white",
+    "paper": "equation (A.1) with the filtered error's variance but the unfiltered gradient, as "
+    "printed by Brunot et al. 2016: not to be trusted",
+}
+
+
+class Optimum(eqx.Module):
+    """Where a least-squares fit ended, so that it can be linearised again.
+
+    - `problem`: what was minimised; `theta`: its parameters, those of a noise filter last;
+      `start`: initial states.
+    """
+
+    problem: Problem
+    theta: Float[Any, " values"]
+    start: Float[Any, "recordings initials"]
+
+
+class Reduced(eqx.Module):
+    """Residuals and derivatives by recording, with what nuisances can explain taken out.
+
+    Nuisances are initial states and the noise filter's coefficients. `rows` says which rows count.
+    """
+
+    residuals: list[Float[np.ndarray, "_samples outputs"]]
+    jacobians: list[Float[np.ndarray, "_samples outputs parameters"]]
+    spent: Float[np.ndarray, " outputs"]
+
+    @classmethod
+    def of(cls, optimum: Optimum, found: Sensitivity | None = None) -> "Reduced":
+        """At an optimum, with its linearisation if there is one already."""
+        problem = optimum.problem
+        if found is None:
+            found = linearise(problem, jnp.asarray(optimum.theta), jnp.asarray(optimum.start)).found
+        p = problem.loop.theta.shape[0]
+        found = absorb_start(found, problem.free)
+        jacobian, residual = np.asarray(found.jacobian), np.asarray(found.residual)
+        flat = jacobian.reshape(-1, jacobian.shape[-1])
+        own, past = flat[:, :p], flat[:, p:]
+        past = past[:, np.any(past != 0, axis=0)]
+        if past.shape[1]:
+            own = own - past @ np.linalg.lstsq(past, own, rcond=1e-12)[0]
+        own = own.reshape(*jacobian.shape[:-1], p)
+        # Rows before the filter is filled are zero; freedom is counted on those that are not.
+        kept = np.asarray(problem.batch.kept)
+        residuals = [r[there] for r, there in zip(residual, kept, strict=True)]
+        jacobians = [j[there] for j, there in zip(own, kept, strict=True)]
+        return cls(residuals, jacobians, spent_by(problem))
+
+    def filled(self) -> list[np.ndarray]:
+        """Which rows of each recording and output are not blank, `(samples, outputs)`."""
+        return [r != 0 for r in self.residuals]
+
+    def spread(self, full: bool) -> Float[np.ndarray, "outputs outputs"]:
+        """Covariance of the filtered residual, over its degrees of freedom."""
+        stacked = np.concatenate(self.residuals)
+        rows = np.sum(np.concatenate(self.filled()), axis=0)
+        freedom = np.maximum(rows - self.spent, 1.0)
+        covariance = stacked.T @ stacked / np.sqrt(np.outer(freedom, freedom))
+        return covariance if full else np.diag(np.diag(covariance))
+
+
+def spent_by(problem: Problem) -> Float[np.ndarray, " outputs"]:
+    """Degrees of freedom that the estimated values take from each output."""
+    outputs = problem.weights.shape[0]
+    spent = np.full(outputs, problem.loop.theta.shape[0] / outputs)
+    spent += float(np.sum(np.asarray(problem.free))) * 2 * problem.loop.joints / outputs
+    if problem.coefficients is not None:
+        rows = np.asarray(problem.coefficients.row)[np.asarray(problem.coefficients.there)]
+        return spent + np.bincount(rows, minlength=outputs)
+    # A given filter counts as well: as a rule it was estimated from these very residuals.
+    taps = np.asarray(problem.noise)
+    return spent + np.sum((taps != 0).reshape(outputs, -1), axis=1) - 1
+
+
+def covariance_of(
+    optimum: Optimum,
+    kind: Deviations,
+    noise: Noise = None,
+    found: Sensitivity | None = None,
+) -> tuple[Float[np.ndarray, "parameters parameters"], tuple[str, ...]]:
+    """Covariance of the loop's parameters, and what the recordings do not determine.
+
+    **Arguments:**
+
+    - `kind`: see `SAID`.
+    - `noise`: filters that the kind `"paper"` takes the error's variance after.
+    - `found`: the linearisation at the optimum, if it is at hand.
+    """
+    problem = optimum.problem
+    names = problem.loop.names
+    scales = np.asarray(Bounds.of(problem.loop.free_parameters).scale)
+    if kind == "paper":
+        return determined_covariance(_papers_information(optimum, noise), names, scales)
+    reduced = Reduced.of(optimum, found)
+    jacobians, meat = reduced.jacobians, None
+    if kind == "sandwich":
+        meat = score_covariance(reduced.residuals, jacobians)
+    else:
+        whiten = np.linalg.inv(np.linalg.cholesky(reduced.spread(problem.mix is not None)))
+        jacobians = [np.einsum("ij,kjp->kip", whiten, j) for j in jacobians]
+    information = sum(np.einsum("kop,koq->pq", j, j) for j in jacobians)
+    return determined_covariance(np.asarray(information), names, scales, meat)
+
+
+_plain = eqx.filter_jit(unfiltered)
+
+
+def _papers_information(
+    optimum: Optimum, noise: Noise
+) -> Float[np.ndarray, "parameters parameters"]:
+    """(A.1) to the letter: one variance of the filtered error for all, and plain gradients."""
+    problem, n = optimum.problem, optimum.problem.loop.joints
+    p = problem.loop.theta.shape[0]
+    loop = problem.loop.with_theta(jnp.asarray(optimum.theta)[:p])
+    start = jnp.asarray(optimum.start)
+    batch = dataclasses.replace(problem.batch, q0=start[:, :n], v0=start[:, n:])
+    units = jnp.ones_like(problem.weights)
+    plain = _plain(loop, batch, units, problem.signals, False)
+    raw, kept = np.asarray(plain.raw), np.asarray(batch.kept)
+    total = sum(
+        float(np.sum(innovations(x[there], noise) ** 2)) for x, there in zip(raw, kept, strict=True)
+    )
+    variance = total / kept.sum()
+    jacobian = np.asarray(plain.jacobian)
+    return np.einsum("rkop,rkoq->pq", jacobian, jacobian) / variance
+
+
+def score_covariance(
+    residuals: Sequence[Float[np.ndarray, "_samples outputs"]],
+    jacobians: Sequence[Float[np.ndarray, "_samples outputs parameters"]],
+) -> Float[np.ndarray, "parameters parameters"]:
+    """Covariance of J'r where residuals are coloured: their spectrum, weighed by J's.
+
+    Each output's residuals are taken as one autoregressive process over all recordings, with the
+    order by AIC, but stronger in one recording than in another: noise that grows with the torque
+    is strongest where the derivatives are largest too. Outputs are taken as uncorrelated.
+    """
+    outputs, p = jacobians[0].shape[1:]
+    meat = np.zeros((p, p))
+    for o in range(outputs):
+        series = [r[:, o] - r[:, o].mean() for r in residuals]
+        strengths = [float(np.std(x)) or 1.0 for x in series]
+        # Residuals that passed a low-pass have next to no power above it, and a filter fitted to
+        # them ends in rounding: a white floor 100 dB down keeps it stable and changes nothing else.
+        floor = np.random.default_rng(0)
+        noise = fit_ar(
+            [
+                x / strength + 1e-5 * floor.standard_normal(len(x))
+                for x, strength in zip(series, strengths, strict=True)
+            ]
+        )
+        for j, strength in zip(jacobians, strengths, strict=True):
+            size = 1 << int(np.ceil(np.log2(2 * j.shape[0])))
+            wave = np.fft.fft(j[:, o], size, axis=0)
+            power = strength**2 * noise.spectrum(size)[:, None]
+            meat += np.real(wave.conj().T @ (power * wave)) / size
+    return meat
+
+
+def optimum_of(fit: Fit, what: str) -> Optimum:
+    """Where a fit ended.
+
+    **Raises:** `FitError` for fits that are not least squares on a simulation.
+    """
+    if fit.optimum is None:
+        raise FitError(
+            f"{fit.method!r} does not minimise the error of a simulation, so it has no {what}: "
+            "fit by OEM, SeparablePEM or JointPEM"
+        )
+    return fit.optimum
+
+
+def deviations(fit: Fit) -> pd.DataFrame:
+    """Standard deviations of a fit by every formula, beside each other.
+
+    **Arguments:**
+
+    - `fit`: by `OEM`, `SeparablePEM` or `JointPEM`.
+
+    **Returns:** a row for each parameter, a column for each of `"sandwich"`, `"white"` (A.1) and
+    `"paper"` (A.1 as printed numbers have it, with the gradient of the unfiltered error).
+
+    **Raises:** `FitError` for a fit by regression.
+    """
+    optimum = optimum_of(fit, "deviations of that kind")
+    columns = {}
+    for kind in SAID:
+        covariance, _ = covariance_of(optimum, kind, fit.noise)  # type: ignore[arg-type]
+        columns[kind] = np.sqrt(np.diag(covariance))
+    return pd.DataFrame(columns, index=pd.Index(fit.names, name="parameter"))
+
+
+def with_deviations(fit: Fit, kind: Deviations) -> Fit:
+    """The same fit, showing deviations of another kind.
+
+    **Raises:** `FitError` for a fit by regression.
+    """
+    optimum = optimum_of(fit, "deviations of that kind")
+    covariance, lost = covariance_of(optimum, kind, fit.noise)
+    return dataclasses.replace(
+        fit, covariance=covariance, undetermined=lost, deviations=SAID[kind]
+    )

@@ -1,0 +1,143 @@
+"""Likelihood profiles: how much the error grows when one parameter is held elsewhere."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from scipy import interpolate, optimize, stats
+
+from ..errors import FitError
+from ._base import Fit
+from .deviations import Reduced, covariance_of, optimum_of
+from .refit import Lanes, refit
+
+# In deviations: dense enough for a cubic, wide enough for intervals of 99.7 %.
+REACH = np.array([-4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0])
+
+
+class Profile(eqx.Module):
+    """Deviance of one parameter: twice the likelihood lost when it is held at a value.
+
+    `values` and `deviance` run along the profile; `others` are the other parameters there.
+    """
+
+    fit: Fit
+    name: str = eqx.field(static=True)
+    values: Float[np.ndarray, " points"]
+    deviance: Float[np.ndarray, " points"]
+    others: Float[np.ndarray, "points parameters"]
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Values whose deviance a share `level` of recordings would not exceed at the truth.
+
+        An end that lies beyond the profile, as where a bound cuts it off, is its last value.
+        """
+        centre = self.fit.theta[self.fit.names.index(self.name)]
+        root = np.sign(self.values - centre) * np.sqrt(self.deviance)
+        along = interpolate.PchipInterpolator(self.values, root)
+        reach = float(np.sqrt(stats.chi2.ppf(level, 1)))
+        ends = []
+        for sign, end in ((-1, self.values[0]), (1, self.values[-1])):
+            if sign * float(along(end)) <= reach:
+                ends.append(float(end))
+                continue
+            goal = sign * reach
+            ends.append(float(optimize.brentq(lambda x, g=goal: float(along(x)) - g, centre, end)))
+        return ends[0], ends[1]
+
+    def __repr__(self) -> str:
+        low, high = self.interval()
+        return f"{self.name}: 95 % from {low:.4g} to {high:.4g} by likelihood profile"
+
+
+def profile(fit: Fit, *names: str) -> dict[str, Profile]:
+    """Likelihood profiles, all points of all of them fitted at once, vmapped.
+
+    Where a fit shows sandwich deviations its error is not taken for white, and the deviance is
+    scaled by the ratio of (A.1)'s variance to the sandwich's (Pace, Salvan, Sartori 2011).
+
+    **Arguments:**
+
+    - `fit`: by `OEM`, `SeparablePEM` or `JointPEM`; the noise filters of the former two are kept.
+    - `names`: of parameters; all of them by default.
+
+    **Raises:** `FitError` for a fit by regression, or a parameter that it does not determine.
+    """
+    optimum = optimum_of(fit, "profile")
+    names = names or fit.names
+    places = [_place(fit, name) for name in names]
+    white, _ = covariance_of(optimum, "white")
+    width = np.sqrt(np.diag(white))
+    low, high = np.asarray(optimum.problem.lower), np.asarray(optimum.problem.upper)
+    theta = np.asarray(optimum.theta)
+    scaled = "sandwich" in fit.deviations
+    points = {
+        k: np.unique(np.clip(theta[k] + width[k] * REACH * _stretch(fit, width, k, scaled),
+                             low[k], high[k]))
+        for k in places
+    }  # fmt: skip
+    lanes = Lanes.around(optimum, sum(len(x) for x in points.values()))
+    held_low, held_high, start = (np.array(x) for x in (lanes.lower, lanes.upper, lanes.theta))
+    row = 0
+    for k, values in points.items():
+        for value in values:
+            held_low[row, k] = held_high[row, k] = start[row, k] = value
+            row += 1
+    lanes = dataclasses.replace(
+        lanes,
+        lower=jnp.asarray(held_low),
+        upper=jnp.asarray(held_high),
+        theta=jnp.asarray(start),
+    )
+    found = refit(optimum, lanes)
+    loss, ended = np.asarray(found.loss), np.asarray(found.theta)[:, : len(theta)]
+    base, variance = _loss_and_variance(optimum)
+    profiles, row = {}, 0
+    for name, (k, values) in zip(names, points.items(), strict=True):
+        rows = slice(row, row + len(values))
+        row += len(values)
+        share = 1 / _stretch(fit, width, k, scaled) ** 2
+        deviance = np.maximum(loss[rows] - base, 0.0) / variance * share
+        # The estimate itself is a point of its profile; it may be one already, on a bound.
+        apart = values != theta[k]
+        order = np.argsort(np.append(values[apart], theta[k]))
+        p = len(fit.names)
+        profiles[name] = Profile(
+            fit,
+            name,
+            np.append(values[apart], theta[k])[order],
+            np.append(deviance[apart], 0.0)[order],
+            np.vstack([ended[rows][apart, :p], theta[None, :p]])[order],
+        )
+    return profiles
+
+
+def _place(fit: Fit, name: str) -> int:
+    if name not in fit.names:
+        raise FitError(f"{name!r} was not estimated: this fit has {', '.join(fit.names)}")
+    k = fit.names.index(name)
+    if not np.isfinite(fit.std[k]):
+        raise FitError(f"these recordings do not determine {name}, so it has no profile")
+    return k
+
+
+def _stretch(fit: Fit, white: Float[np.ndarray, " parameters"], k: int, scaled: bool) -> float:
+    """How much wider than (A.1) has it the profile is to be."""
+    return float(fit.std[k] / white[k]) if scaled else 1.0
+
+
+def _loss_and_variance(optimum) -> tuple[float, float]:
+    """Squared error at the minimum, and its unit: the variance of one filtered residual."""
+    reduced = Reduced.of(optimum)
+    loss = sum(float(np.sum(r**2)) for r in reduced.residuals)
+    rows = float(sum(np.sum(f) for f in reduced.filled()))
+    return loss, loss / (rows - float(np.sum(reduced.spent)))
+
+
+def profile_table(profiles: dict[str, Profile], level: float = 0.95) -> pd.DataFrame:
+    """Intervals of several profiles, one row each."""
+    rows = {name: found.interval(level) for name, found in profiles.items()}
+    return pd.DataFrame(rows, index=["low", "high"]).T.rename_axis("parameter")
