@@ -32,8 +32,15 @@ from .estimate import DIDIM as DIDIM  # noqa: E402
 from .estimate import IDIM as IDIM  # noqa: E402
 from .estimate import IDIMIV as IDIMIV  # noqa: E402
 from .estimate import OEM as OEM  # noqa: E402
+from .estimate import DifferenceLS as DifferenceLS  # noqa: E402
+from .estimate import Differences as Differences  # noqa: E402
+from .estimate import FilteredLS as FilteredLS  # noqa: E402
 from .estimate import Filtering as Filtering  # noqa: E402
 from .estimate import Fit as Fit  # noqa: E402
+from .estimate import FourierLS as FourierLS  # noqa: E402
+from .estimate import FourierStates as FourierStates  # noqa: E402
+from .estimate import IntegralLS as IntegralLS  # noqa: E402
+from .estimate import LowPass as LowPass  # noqa: E402
 from .estimate import SeparablePEM as SeparablePEM  # noqa: E402
 from .estimate import Status as Status  # noqa: E402
 from .estimate import fit as fit  # noqa: E402

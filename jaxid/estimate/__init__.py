@@ -7,6 +7,14 @@ from ._fit import fit as fit
 from ._regression import Filtering as Filtering
 from .didim import DIDIM as DIDIM
 from .didim import IDIMIV as IDIMIV
+from .difference import DifferenceLS as DifferenceLS
+from .filtered import FilteredLS as FilteredLS
+from .fourier import FourierLS as FourierLS
 from .idim import IDIM as IDIM
+from .integral import IntegralLS as IntegralLS
 from .oem import OEM as OEM
 from .pem import SeparablePEM as SeparablePEM
+from .states import AbstractStates as AbstractStates
+from .states import Differences as Differences
+from .states import FourierStates as FourierStates
+from .states import LowPass as LowPass
