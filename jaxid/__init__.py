@@ -18,10 +18,10 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
 from . import arms as arms  # noqa: E402
 from . import control as control  # noqa: E402
 from . import effects as effects  # noqa: E402
+from . import excitation as excitation  # noqa: E402
 from .discovery import Comparison as Comparison  # noqa: E402
 from .discovery import Diagnosis as Diagnosis  # noqa: E402
 from .discovery import Discovery as Discovery  # noqa: E402
-from .discovery import Limits as Limits  # noqa: E402
 from .discovery import compare as compare  # noqa: E402
 from .discovery import diagnose as diagnose  # noqa: E402
 from .discovery import discover as discover  # noqa: E402
@@ -44,6 +44,10 @@ from .estimate import LowPass as LowPass  # noqa: E402
 from .estimate import SeparablePEM as SeparablePEM  # noqa: E402
 from .estimate import Status as Status  # noqa: E402
 from .estimate import fit as fit  # noqa: E402
+from .excitation import Excitation as Excitation  # noqa: E402
+from .excitation import Limits as Limits  # noqa: E402
+from .excitation import PlanarReach as PlanarReach  # noqa: E402
+from .excitation import optimal_excitation as optimal_excitation  # noqa: E402
 from .loop import ClosedLoop as ClosedLoop  # noqa: E402
 from .parameters import parameter as parameter  # noqa: E402
 from .recording import Recording as Recording  # noqa: E402

@@ -25,6 +25,10 @@ class SaveError(JaxidError, ValueError):
     """A saved result, or a piece of a campaign, cannot be written or read."""
 
 
+class LimitsError(JaxidError, ValueError):
+    """Limits contradict each other, or leave no room for any motion."""
+
+
 class MissingExtraError(JaxidError, ImportError):
     """A package is needed that only an optional extra of jaxid installs."""
 

@@ -47,8 +47,9 @@ def as_motion(motion: Simulated, recording: Recording) -> Motion:
     """A motion as effects see it, `(samples,)` before every axis."""
     n = motion.q.shape[0]
     label = jnp.full(n, recording_label(recording.name))
-    signals = (motion.time, motion.q, motion.v, motion.a, motion.tau, np.zeros((n, 0)))
-    return jax.vmap(Motion)(*(jnp.asarray(x) for x in signals), label)
+    signals = (motion.time, motion.q, motion.v, motion.a, motion.tau)
+    t, q, v, a, tau = (jnp.asarray(x) for x in signals)
+    return jax.vmap(Motion)(t, q, v, a, tau, jnp.zeros((n, 0)), label)
 
 
 def split_torque(
@@ -153,7 +154,7 @@ def split_rows(
         q, v, _ = states.rates(recording, x)
         return np.stack([operator(0, q), operator(0, v), operator(1, v)])
 
-    extra = operator.transient(motion.time)[at] if transient == "modelled" else None
+    extra = operator.transient(np.asarray(motion.time))[at] if transient == "modelled" else None
     there = jax.tree.map(lambda x: x[at], motion)
     return Rows(picked[..., :-1], picked[..., -1], extra, there, kernels, at)
 
