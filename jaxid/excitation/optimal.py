@@ -179,7 +179,8 @@ class Excitation(eqx.Module):
 
     def table(self) -> pd.DataFrame:
         """Predicted deviations."""
-        units = [self.loop.unit(p) for p in self.loop.parameters for n in p.names if n in self.names]
+        known = {n: self.loop.unit(p) for p in self.loop.parameters for n in p.names}
+        units = [known[name] for name in self.names]
         return pd.DataFrame(
             {"std": self.std, "unit": units}, index=pd.Index(self.names, name="parameter")
         )
@@ -434,7 +435,8 @@ def _descend(
     points, kinds = _active(margins, reach).T
 
     def limits(x):
-        return np.asarray(_margins_and_slopes(design, jnp.asarray(x))[0])[points, kinds] - 2 * _SLACK
+        margins = np.asarray(_margins_and_slopes(design, jnp.asarray(x))[0])
+        return margins[points, kinds] - 2 * _SLACK
 
     def slopes(x):
         return np.asarray(_margins_and_slopes(design, jnp.asarray(x))[1])[points, kinds]

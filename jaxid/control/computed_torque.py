@@ -1,0 +1,93 @@
+"""Computed torque with a PID law on a model that is not quite the arm."""
+
+from typing import Protocol, runtime_checkable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..parameters import known
+from ._base import AbstractController, Reading, Reference
+from .pd import _vector
+
+
+@runtime_checkable
+class Body(Protocol):
+    """Equations of motion that a law may hold for the arm's."""
+
+    def mass_matrix(self, q: Float[Array, " joints"]) -> Float[Array, "joints joints"]:
+        """Inertia at q."""
+        ...
+
+    def bias(
+        self, q: Float[Array, " joints"], v: Float[Array, " joints"]
+    ) -> Float[Array, " joints"]:
+        """Torque besides that of the acceleration."""
+        ...
+
+
+class ComputedTorque(AbstractController):
+    """tau = M̂ (a_ref + Kd e' + Kp e + Ki ∫e) + ĥ(q, v), with e = q_ref - q.
+
+    M̂ and ĥ are those of `model`, whose values a fit leaves alone (Li, Peng, Juang 2023).
+
+    **Arguments:**
+
+    - `model`: what the law takes the arm for.
+    - `Kp`, `Ki`, `Kd`: gains, `(joints,)`, 1/s², 1/s³ and 1/s.
+    - `every`: period, s, of a law that computes with encoders alone: velocity is the difference
+      of the last two readings, and the torque holds until the next tick. None for a continuous
+      law that is given velocities.
+    """
+
+    model: Body = known()
+    Kp: Float[Array, " joints"] = eqx.field(converter=_vector)
+    Ki: Float[Array, " joints"] = eqx.field(converter=_vector)
+    Kd: Float[Array, " joints"] = eqx.field(converter=_vector)
+    every: float | None = eqx.field(static=True, default=None)
+
+    @property
+    def period(self) -> float | None:
+        """Time between two ticks, s; None for a continuous law."""
+        return self.every
+
+    def initial_state(self, reading: Reading) -> Float[Array, " states"]:
+        """No integral; of a sampled law also the last reading and no torque yet."""
+        zero = jnp.zeros_like(reading.q)
+        if self.every is None:
+            return zero
+        return jnp.concatenate([zero, reading.q - self.every * reading.v, zero])
+
+    def _law(self, reading: Reading, reference: Reference, integral) -> Float[Array, " joints"]:
+        error, rate = reference.q - reading.q, reference.v - reading.v
+        asked = reference.a + self.Kd * rate + self.Kp * error + self.Ki * integral
+        torque = self.model.mass_matrix(reading.q) @ asked
+        return torque + self.model.bias(reading.q, reading.v) + reference.tau
+
+    def derivative(
+        self, reading: Reading, reference: Reference, state: Float[Array, " states"]
+    ) -> Float[Array, " states"]:
+        """The error, of a continuous law."""
+        return jnp.zeros_like(state) if self.every else reference.q - reading.q
+
+    def tick(
+        self, reading: Reading, reference: Reference, state: Float[Array, " states"]
+    ) -> Float[Array, " states"]:
+        """Integral, reading and the torque to hold."""
+        assert self.every is not None
+        integral, last, _ = jnp.split(state, 3)
+        seen = Reading(reading.q, (reading.q - last) / self.every)
+        integral = integral + self.every * (reference.q - reading.q)
+        return jnp.concatenate([integral, reading.q, self._law(seen, reference, integral)])
+
+    def command(
+        self,
+        reading: Reading,
+        reference: Reference,
+        state: Float[Array, " states"],
+        mass: Float[Array, "joints joints"],
+    ) -> Float[Array, " joints"]:
+        """The law's torque, `(joints,)`, N·m or N; of a sampled law the one that holds."""
+        if self.every is None:
+            return self._law(reading, reference, state)
+        return jnp.split(state, 3)[2]
