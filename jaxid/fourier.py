@@ -3,7 +3,7 @@
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import interpolate, signal
+from scipy import interpolate, linalg, signal
 
 from .errors import FitError
 from .recording import Recording
@@ -172,8 +172,10 @@ def settle_harmonics(recording: Recording, period: float, harmonics: int | None)
     time = even_times(recording)
     x = resampled(recording.time, recording.q, time)
     most = min(most, 100)
-    wide, _ = np.linalg.qr(fourier_basis(time, period, most)[0])
-    parts = (wide.T @ x) ** 2
+    wide = fourier_basis(time, period, most)[0]
+    # Gram-Schmidt by Cholesky: the waves are all but orthogonal, and there are many samples.
+    lower = linalg.cholesky(wide.T @ wide, lower=True)
+    parts = linalg.solve_triangular(lower, wide.T @ x, lower=True) ** 2
     gained = np.concatenate([parts[:1], parts[1::2] + parts[2::2]])
     left = np.sum(x**2, axis=0) - np.cumsum(gained, axis=0)
     n = recording.samples

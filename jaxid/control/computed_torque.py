@@ -36,8 +36,9 @@ class ComputedTorque(AbstractController):
     - `model`: what the law takes the arm for.
     - `Kp`, `Ki`, `Kd`: gains, `(joints,)`, 1/s², 1/s³ and 1/s.
     - `every`: period, s, of a law that computes with encoders alone: velocity is the difference
-      of the last two readings, and the torque holds until the next tick. None for a continuous
-      law that is given velocities.
+      of readings `window` ticks apart, and the torque holds until the next tick. None for a
+      continuous law that is given velocities.
+    - `window`: ticks.
     """
 
     model: Body = known()
@@ -45,6 +46,7 @@ class ComputedTorque(AbstractController):
     Ki: Float[Array, " joints"] = eqx.field(converter=_vector)
     Kd: Float[Array, " joints"] = eqx.field(converter=_vector)
     every: float | None = eqx.field(static=True, default=None)
+    window: int = eqx.field(static=True, default=1)
 
     @property
     def period(self) -> float | None:
@@ -52,11 +54,12 @@ class ComputedTorque(AbstractController):
         return self.every
 
     def initial_state(self, reading: Reading) -> Float[Array, " states"]:
-        """No integral; of a sampled law also the last reading and no torque yet."""
+        """No integral; of a sampled law also no torque yet, and the last readings, newest first."""
         zero = jnp.zeros_like(reading.q)
         if self.every is None:
             return zero
-        return jnp.concatenate([zero, reading.q - self.every * reading.v, zero])
+        past = [reading.q - k * self.every * reading.v for k in range(1, self.window + 1)]
+        return jnp.concatenate([zero, zero, *past])
 
     def _law(self, reading: Reading, reference: Reference, integral) -> Float[Array, " joints"]:
         error, rate = reference.q - reading.q, reference.v - reading.v
@@ -73,12 +76,13 @@ class ComputedTorque(AbstractController):
     def tick(
         self, reading: Reading, reference: Reference, state: Float[Array, " states"]
     ) -> Float[Array, " states"]:
-        """Integral, reading and the torque to hold."""
+        """Integral, the torque to hold, and the readings."""
         assert self.every is not None
-        integral, last, _ = jnp.split(state, 3)
-        seen = Reading(reading.q, (reading.q - last) / self.every)
+        integral, _, *past = jnp.split(state, 2 + self.window)
+        seen = Reading(reading.q, (reading.q - past[-1]) / (self.window * self.every))
         integral = integral + self.every * (reference.q - reading.q)
-        return jnp.concatenate([integral, reading.q, self._law(seen, reference, integral)])
+        torque = self._law(seen, reference, integral)
+        return jnp.concatenate([integral, torque, reading.q, *past[:-1]])
 
     def command(
         self,
@@ -90,4 +94,4 @@ class ComputedTorque(AbstractController):
         """The law's torque, `(joints,)`, N·m or N; of a sampled law the one that holds."""
         if self.every is None:
             return self._law(reading, reference, state)
-        return jnp.split(state, 3)[2]
+        return jnp.split(state, 2 + self.window)[1]

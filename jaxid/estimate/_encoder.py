@@ -127,12 +127,14 @@ def row_errors(
 
 def _low_rank_whitening(wide: np.ndarray, rest: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     scale = np.sqrt(rest)[:, None]
-    left, size, _ = np.linalg.svd(wide / scale, full_matrices=False)
-    shrink = 1 / np.sqrt(1 + size**2) - 1
+    tall = wide / scale
+    square, turn = np.linalg.eigh(tall.T @ tall)
+    size = np.maximum(square, 1e-15 * square[-1])
+    inner = (turn * ((1 / np.sqrt(1 + size) - 1) / size)) @ turn.T
 
     def whiten(x: np.ndarray) -> np.ndarray:
         y = x / scale
-        return y + left @ (shrink[:, None] * (left.T @ y))
+        return y + tall @ (inner @ (tall.T @ y))
 
     return whiten
 

@@ -31,7 +31,7 @@ EncoderWeights = Literal["joint", "encoder"]
 class Rows(eqx.Module):
     """The regression of one recording: equations, and what is needed to weigh them.
 
-    `transient` holds columns that each joint's rows may contain besides, or None; `kernels` is
+    `states` say where its motion came from. `transient` holds columns that each joint's rows may contain besides, or None; `kernels` is
     what recorded positions become on their way into the rows, which are the samples `at`.
     """
 
@@ -39,6 +39,7 @@ class Rows(eqx.Module):
     right: Float[np.ndarray, "rows joints"]
     transient: Float[np.ndarray, "rows columns"] | None
     motion: Simulated
+    states: AbstractStates
     kernels: Kernels = eqx.field(static=True)
     at: slice = eqx.field(static=True)
 
@@ -52,9 +53,7 @@ def as_motion(motion: Simulated, recording: Recording) -> Motion:
     return jax.vmap(Motion)(t, q, v, a, tau, jnp.zeros((n, 0)), label)
 
 
-def split_torque(
-    loop: ClosedLoop, at: Motion, once: bool
-) -> Float[Array, "4 samples joints"]:
+def split_torque(loop: ClosedLoop, at: Motion, once: bool) -> Float[Array, "4 samples joints"]:
     """What the motion takes less what the drives deliver, in parts that need no acceleration.
 
     The parts are to be differentiated twice, once and not at all; the last is the torque that is
@@ -125,6 +124,7 @@ def split_rows(
     **Raises:** `FitError` where an effect needs an acceleration, or no rows are left.
     """
     _check_effects(loop, method)
+    states = states.resolved(recording)
     once = len(operator.poles) == 1
     motion = states.motion(recording)
     columns, right = (np.asarray(x) for x in _columns(loop, as_motion(motion, recording), once))
@@ -156,11 +156,12 @@ def split_rows(
 
     extra = operator.transient(np.asarray(motion.time))[at] if transient == "modelled" else None
     there = jax.tree.map(lambda x: x[at], motion)
-    return Rows(picked[..., :-1], picked[..., -1], extra, there, kernels, at)
+    return Rows(picked[..., :-1], picked[..., -1], extra, there, states, kernels, at)
 
 
 def motion_rows(loop: ClosedLoop, recording: Recording, states: AbstractStates) -> Rows:
     """The equations of one recording along position, velocity and acceleration as estimated."""
+    states = states.resolved(recording)
     motion = states.motion(recording)
     columns, right = regression(loop, recording, motion)
     edge = states.edge(recording)
@@ -169,7 +170,8 @@ def motion_rows(loop: ClosedLoop, recording: Recording, states: AbstractStates) 
     def kernels(x: np.ndarray) -> np.ndarray:
         return np.stack(states.rates(recording, x))
 
-    return Rows(columns[at], right[at], None, jax.tree.map(lambda x: x[at], motion), kernels, at)
+    there = jax.tree.map(lambda x: x[at], motion)
+    return Rows(columns[at], right[at], None, there, states, kernels, at)
 
 
 def _without_transient(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
@@ -188,7 +190,6 @@ def fit_rows(
     loop: ClosedLoop,
     recordings: Recordings,
     method: AbstractMethod,
-    states: AbstractStates,
     weights: EncoderWeights,
     rows_of: Callable[[Recording], Rows],
 ) -> Fit:
@@ -196,7 +197,7 @@ def fit_rows(
 
     **Arguments:**
 
-    - `method`: as results show it. `states`: as the rows were made with.
+    - `method`: as results show it.
     - `weights`: `"joint"`, or `"encoder"` for the covariance that follows from the resolution.
     - `rows_of`: gives the rows of a recording.
 
@@ -226,7 +227,7 @@ def fit_rows(
         solved = _coloured(stacked, solved, names)
         how = "sandwich estimate for coloured residuals"
     else:
-        solved = _weighted(loop, recordings, states, rows, stacked, solved, names)
+        solved = _weighted(loop, recordings, rows, stacked, solved, names)
         how = "covariance of the encoder's errors, Q²/12 through every operator"
     fit = regression_fit(loop, recordings, method, stacked, solved, started)
     return dataclasses.replace(fit, deviations=how)
@@ -247,7 +248,6 @@ def _coloured(stacked: Stacked, solved: Solved, names: tuple[str, ...]) -> Solve
 def _weighted(
     loop: ClosedLoop,
     recordings: Recordings,
-    states: AbstractStates,
     rows: Sequence[Rows],
     stacked: Stacked,
     solved: Solved,
@@ -256,7 +256,7 @@ def _weighted(
     """The solution with the covariance that a first one gives, twice."""
     chosen = linear_parameters(loop)
     heard = [
-        errors_of(recording, states, r.kernels, r.at, r.at.step)
+        errors_of(recording, r.states, r.kernels, r.at, r.at.step)
         for recording, r in zip(recordings, rows, strict=True)
     ]
     for _ in range(2):

@@ -39,4 +39,4 @@ class FilteredLS(AbstractMethod):
             operator = Operator.of((self.pole or default_pole(recording),), recording)
             return split_rows(loop, recording, self, self.states, operator, self.transient)
 
-        return fit_rows(loop, recordings, self, self.states, self.weights, rows)
+        return fit_rows(loop, recordings, self, self.weights, rows)

@@ -3,7 +3,7 @@
 import equinox as eqx
 
 from ..loop import ClosedLoop
-from ..recording import Recordings
+from ..recording import Recording, Recordings
 from ._base import AbstractMethod, Fit
 from ._split import EncoderWeights, fit_rows, motion_rows
 from .states import FourierStates
@@ -30,11 +30,8 @@ class FourierLS(AbstractMethod):
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
         """Estimates the parameters in which torque is linear; called by `jaxid.fit`."""
         states = FourierStates(self.period, self.harmonics)
-        return fit_rows(
-            loop,
-            recordings,
-            self,
-            states,
-            self.weights,
-            lambda recording: motion_rows(loop, recording, states),
-        )
+
+        def rows(recording: Recording):
+            return motion_rows(loop, recording, states)
+
+        return fit_rows(loop, recordings, self, self.weights, rows)

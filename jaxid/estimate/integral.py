@@ -53,4 +53,4 @@ class IntegralLS(AbstractMethod):
             operator = Operator.of((first, self.lambda2 or first), recording)
             return split_rows(loop, recording, self, self.states, operator, self.transient)
 
-        return fit_rows(loop, recordings, self, self.states, self.weights, rows)
+        return fit_rows(loop, recordings, self, self.weights, rows)

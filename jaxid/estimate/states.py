@@ -41,6 +41,10 @@ class AbstractStates(eqx.Module):
     def memory(self, recording: Recording) -> int | None:
         """Samples over which one of them is felt; None for all."""
 
+    def resolved(self, recording: Recording) -> "AbstractStates":
+        """The same with everything settled that the recording decides."""
+        return self
+
     def motion(self, recording: Recording) -> Simulated:
         """The recording's motion on even times, with its torque."""
         time = even_times(recording)
@@ -126,9 +130,17 @@ class FourierStates(AbstractStates):
         """
         return settle_harmonics(recording, period_of(recording, self.period), self.harmonics)
 
+    def resolved(self, recording: Recording) -> "FourierStates":
+        """With its period and number of harmonics."""
+        found = self.settled(recording)
+        return FourierStates(found.period, found.harmonics)
+
     def basis(self, recording: Recording) -> Float[np.ndarray, "3 samples coefficients"]:
         """The series' functions and their first two derivatives at the even times."""
-        found = self.settled(recording)
+        found = self
+        if self.period is None or self.harmonics is None:
+            found = self.settled(recording)
+        assert found.period is not None and found.harmonics is not None
         return fourier_basis(even_times(recording), found.period, found.harmonics)
 
     def rates(self, recording: Recording, x: Float[np.ndarray, "samples columns"]) -> Rates:

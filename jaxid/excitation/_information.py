@@ -17,9 +17,7 @@ from ..simulate import NOBODY, Interval, initial, run_with_sensitivities
 Kind = Literal["inverse-dynamics", "closed-loop"]
 
 
-def along(
-    time: Float[Array, " points"], signals: Float[Array, "3 points joints"]
-) -> Motion:
+def along(time: Float[Array, " points"], signals: Float[Array, "3 points joints"]) -> Motion:
     """Position, velocity and acceleration as effects see them, without torque."""
     n = time.shape[0]
     q, v, a = signals

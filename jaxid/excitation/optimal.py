@@ -89,9 +89,7 @@ def margins_along(
     return jnp.stack(rows, axis=1), inside
 
 
-def _margins(
-    design: Design, z: Float[Array, " numbers"]
-) -> Float[Array, "points kinds"]:
+def _margins(design: Design, z: Float[Array, " numbers"]) -> Float[Array, "points kinds"]:
     signals = design.basis @ design.coefficients(z)
     tau = torque_along(design.loop, jnp.asarray(design.time), signals)
     rows, inside = margins_along(design.limits, signals, tau)
@@ -223,9 +221,7 @@ def _check(loop: ClosedLoop, limits: Limits, period: float, harmonics: int, rate
         )
     own = loop.controller.period
     if own is not None and abs(own * rate - 1) > 1e-6:
-        raise FitError(
-            f"the controller ticks every {own:g} s: design at its rate, {1 / own:g} Hz"
-        )
+        raise FitError(f"the controller ticks every {own:g} s: design at its rate, {1 / own:g} Hz")
 
 
 def _static_margins(
