@@ -28,6 +28,7 @@ import jaxid
 from jaxid import figures
 from jaxid.control import ComputedTorque
 from jaxid.excitation import Excitation
+from jaxid.fourier import FourierSeries
 from jaxid.simulate import initial, prepare, run, run_with_sensitivities, with_substeps
 
 from ._output import report
@@ -88,12 +89,13 @@ def excitation(quick: bool = False) -> Excitation:
     )
 
 
-def draw(reference: Excitation, bits: tuple[int, ...], draws: int) -> dict[int, sim.Batch]:
-    """Recordings of every resolution, all simulated side by side."""
-    rng = np.random.default_rng(2023)
-    offset = np.tile(rng.uniform(-0.5, 0.5, (draws, 2)), (len(bits), 1))
+def draw(series: FourierSeries, bits: tuple[int, ...], chosen: range) -> dict[int, sim.Batch]:
+    """Recordings of every resolution, all simulated side by side; `chosen` says which draws."""
+    draws = len(chosen)
+    offset = np.random.default_rng(2023).uniform(-0.5, 0.5, (DRAWS, 2))[chosen]
+    offset = np.tile(offset, (len(bits), 1))
     time = TICK * np.arange(round(3 * PERIOD / TICK) + 1)
-    asked = np.asarray(reference.series(time))
+    asked = np.asarray(series(time))
     resolution = np.repeat([2 * np.pi / 2.0**b for b in bits], draws)
     law = sim.SampledComputedTorque(model_of_the_law(), **GAINS, period=TICK)
     runs = sim.simulate_batch([TRUE] * len(resolution), asked, law, resolution, offset, substeps=2)
@@ -105,9 +107,9 @@ def draw(reference: Excitation, bits: tuple[int, ...], draws: int) -> dict[int, 
     }
 
 
-def recording(runs: sim.Batch, k: int, bits: int, reference: Excitation, part: slice):
+def recording(runs: sim.Batch, k: int, bits: int, series: FourierSeries, part: slice):
     """One draw as jaxid reads it."""
-    q_ref = np.asarray(reference.series(runs.time))[0]
+    q_ref = np.asarray(series(runs.time))[0]
     return jaxid.Recording.from_arrays(
         runs.time[part],
         runs.q[k, part],
@@ -156,13 +158,13 @@ class Chord(eqx.Module):
         return jax.lax.map(one, tau, batch_size=25)
 
 
-def chord(reference: Excitation, runs: sim.Batch) -> Chord:
-    """What all draws share."""
-    one = recording(runs, 0, 18, reference, FROM_REST)
+def chord(series: FourierSeries, runs: sim.Batch, part: slice = FROM_REST) -> Chord:
+    """What all draws share, for a part of their recordings that starts at rest."""
+    one = recording(runs, 0, 18, series, part)
     model = with_substeps(loop(), jaxid.Recordings.of(one))
     batch = prepare(model, [one])
     intervals = jax.tree.map(lambda x: x[0], batch.intervals)
-    starts = jnp.asarray(np.asarray(reference.series(np.zeros(1)))[:2, 0])
+    starts = jnp.asarray(np.asarray(series(np.zeros(1)))[:2, 0])
     x0 = initial(model, intervals, *starts)
     zero = jnp.zeros((len(x0), len(model.theta)))
     _, by = run_with_sensitivities(model, intervals, x0, zero, (0,))
@@ -181,29 +183,41 @@ def errors(names: tuple[str, ...], theta: np.ndarray) -> dict[str, float]:
     return {"inertial": size(INERTIAL), "friction": size(FRICTION)}
 
 
-def study(bits: tuple[int, ...], draws: int, quick: bool = False) -> pd.DataFrame:
-    """Rows: method and resolution; errors over the draws, and seconds for one estimate."""
-    reference = excitation(quick)
-    runs = draw(reference, bits, draws)
+Estimates = dict[tuple[str, int], tuple[np.ndarray, float]]
+
+
+def estimate(series: FourierSeries, runs: dict[int, sim.Batch]) -> Estimates:
+    """By method and resolution: estimates, (draws, parameters), and seconds for one."""
     model = loop()
-    shared = chord(reference, runs[bits[0]])
-    rows = []
-    for b in bits:
+    shared = chord(series, next(iter(runs.values())))
+    found: Estimates = {}
+    for b, batch in runs.items():
+        draws = len(batch.q)
         for name, method in METHODS.items():
             started = time.perf_counter()
             fits = [
-                jaxid.fit(model, recording(runs[b], k, b, reference, SETTLED), method)
+                jaxid.fit(model, recording(batch, k, b, series, SETTLED), method)
                 for k in range(draws)
             ]
             seconds = (time.perf_counter() - started) / draws
-            found = errors(model.names, np.array([f.theta for f in fits]))
-            rows.append({"method": name, "bits": b} | found | {"seconds": seconds})
+            found[name, b] = np.array([f.theta for f in fits]), seconds
         started = time.perf_counter()
-        theta = np.asarray(shared.solve(jnp.asarray(runs[b].tau[:, FROM_REST])))
-        seconds = (time.perf_counter() - started) / draws
-        found = errors(model.names, theta) | {"seconds": seconds}
-        rows.append({"method": "OEM", "bits": b} | found)
-    return pd.DataFrame(rows)
+        theta = np.asarray(shared.solve(jnp.asarray(batch.tau[:, FROM_REST])))
+        found["OEM", b] = theta, (time.perf_counter() - started) / draws
+    return found
+
+
+def table(found: Estimates) -> pd.DataFrame:
+    """Rows: method and resolution; errors over the draws, and seconds for one estimate."""
+    names = loop().names
+    return pd.DataFrame(
+        [
+            {"method": name, "bits": b, "draws": len(theta)}
+            | errors(names, theta)
+            | {"seconds": seconds}
+            for (name, b), (theta, seconds) in found.items()
+        ]
+    )
 
 
 def figure(found: pd.DataFrame) -> go.Figure:
@@ -245,12 +259,13 @@ def main() -> None:
     parser.add_argument("--bits", type=int, nargs="+", default=list(BITS), help="which encoders")
     given = parser.parse_args()
     bits = (10, 14) if given.quick else tuple(given.bits)
-    found = study(bits, 3 if given.quick else DRAWS, given.quick)
+    series = excitation(given.quick).series
+    found = table(estimate(series, draw(series, bits, range(3 if given.quick else DRAWS))))
     report(found, given.json)
     for what in ("inertial", "friction"):
-        table = found.pivot_table(index="method", columns="bits", values=what, sort=False)
+        wide = found.pivot_table(index="method", columns="bits", values=what, sort=False)
         print(f"\nroot mean square error, {what}, %:")
-        print(table.to_string(float_format=lambda x: f"{x:.3g}"))
+        print(wide.to_string(float_format=lambda x: f"{x:.3g}"))
     print(verdict(found))
     if given.figure is not None:
         drawn = figure(found)

@@ -31,8 +31,9 @@ EncoderWeights = Literal["joint", "encoder"]
 class Rows(eqx.Module):
     """The regression of one recording: equations, and what is needed to weigh them.
 
-    `states` say where its motion came from. `transient` holds columns that each joint's rows may contain besides, or None; `kernels` is
-    what recorded positions become on their way into the rows, which are the samples `at`.
+    `states` say where its motion came from. `transient` holds columns that each joint's rows may
+    contain besides, or None; `kernels` is what recorded positions become on their way into the
+    rows, which are the samples `at`.
     """
 
     columns: Float[np.ndarray, "rows joints parameters"]

@@ -137,11 +137,11 @@ class FourierStates(AbstractStates):
 
     def basis(self, recording: Recording) -> Float[np.ndarray, "3 samples coefficients"]:
         """The series' functions and their first two derivatives at the even times."""
-        found = self
-        if self.period is None or self.harmonics is None:
+        period, harmonics = self.period, self.harmonics
+        if period is None or harmonics is None:
             found = self.settled(recording)
-        assert found.period is not None and found.harmonics is not None
-        return fourier_basis(even_times(recording), found.period, found.harmonics)
+            period, harmonics = found.period, found.harmonics
+        return fourier_basis(even_times(recording), period, harmonics)
 
     def rates(self, recording: Recording, x: Float[np.ndarray, "samples columns"]) -> Rates:
         """The fitted series and its derivatives."""

@@ -116,6 +116,7 @@ def _feasible_share(
     return jax.lax.fori_loop(0, 20, body, (jnp.zeros(()), jnp.ones(())))[0]
 
 
+@eqx.filter_jit
 def _information(design: Design, z: Float[Array, " numbers"]) -> Float[Array, "p p"]:
     signals = design.sampled @ design.coefficients(z)
     noise = jnp.asarray(design.settings.noise)
@@ -582,6 +583,23 @@ def _report(
         float(rate),
         settings.kind,
     )
+
+
+def information_along(
+    design: Design, z: Float[np.ndarray, " numbers"]
+) -> Float[np.ndarray, "parameters parameters"]:
+    """Information of one period of a reference of the search space."""
+    return np.asarray(_information(design, jnp.asarray(z)))
+
+
+def margins_on(
+    excitation: Excitation, time: Float[np.ndarray, " points"]
+) -> Float[np.ndarray, "points kinds"]:
+    """How far a reference is from each limit at times, s, as a share of it."""
+    signals = jnp.asarray(excitation.series(time))
+    tau = torque_along(excitation.loop, jnp.asarray(time), signals)
+    rows, inside = margins_along(excitation.limits, signals, tau)
+    return np.concatenate([np.asarray(rows).reshape(len(rows), -1), np.asarray(inside)], axis=1)
 
 
 def _margin_table(design: Design, smallest: Float[np.ndarray, " kinds"]) -> pd.DataFrame:
