@@ -43,7 +43,9 @@ def test_every_limit_holds_between_samples_too(found):
     # By the independent arm, at times that are no multiple of any step of the search.
     t = np.linspace(0.0, 4.0, 17389)
     q, v, a = found.series(t)
-    tau = np.array([sim.inverse_dynamics(TRUE, *(x.tolist() for x in r)) for r in zip(q, v, a)])
+    tau = np.array(
+        [sim.inverse_dynamics(TRUE, *(x.tolist() for x in r)) for r in zip(q, v, a, strict=True)]
+    )
     room = limits()
     assert np.all(q > room.low)
     assert np.all(q < room.high)

@@ -25,6 +25,7 @@ def along(time: Float[Array, " points"], signals: Float[Array, "3 points joints"
     return jax.vmap(Motion)(time, q, v, a, zero, jnp.zeros((n, 0)), jnp.full(n, NOBODY))
 
 
+@eqx.filter_jit
 def torque_along(
     loop: ClosedLoop, time: Float[Array, " points"], signals: Float[Array, "3 points joints"]
 ) -> Float[Array, "points joints"]:
@@ -37,6 +38,7 @@ def chosen_parameters(loop: ClosedLoop, kind: Kind) -> tuple[Parameter, ...]:
     return linear_parameters(loop) if kind == "inverse-dynamics" else loop.free_parameters
 
 
+@eqx.filter_jit
 def inverse_columns(
     loop: ClosedLoop, time: Float[Array, " points"], signals: Float[Array, "3 points joints"]
 ) -> Float[Array, "points joints parameters"]:
@@ -50,7 +52,9 @@ def inverse_columns(
 
 
 def intervals_of(
-    loop: ClosedLoop, time: Float[np.ndarray, " points"], signals: Float[Array, "3 points joints"]
+    loop: ClosedLoop,
+    time: Float[Array | np.ndarray, " points"],
+    signals: Float[Array, "3 points joints"],
 ) -> Interval:
     """A reference as the simulation takes it: cubics that meet positions and velocities."""
     q, v, _ = signals
@@ -73,8 +77,11 @@ def intervals_of(
     )
 
 
+@eqx.filter_jit
 def closed_loop_columns(
-    loop: ClosedLoop, time: Float[np.ndarray, " points"], signals: Float[Array, "3 points joints"]
+    loop: ClosedLoop,
+    time: Float[Array | np.ndarray, " points"],
+    signals: Float[Array, "3 points joints"],
 ) -> tuple[Float[Array, "points 3 joints"], Float[Array, "points joints parameters"]]:
     """Torque, position and velocity of the loop that tracks a reference from rest at its start.
 

@@ -19,7 +19,7 @@ from ..estimate._base import determined_covariance
 from ..fourier import FourierSeries, fourier_basis
 from ..loop import ClosedLoop
 from ..parameters import Bounds
-from ..recording import Recording
+from ..recording import Recording, Recordings
 from ..simulate import fastest_rate, set_substeps
 from ._information import (
     Kind,
@@ -351,7 +351,7 @@ def make_design(
 def _fastest_at(loop: ClosedLoop, pose: Float[np.ndarray, " joints"]) -> float:
     """Largest eigenvalue of the loop at standstill in a pose, 1/s."""
     q = np.stack([pose, pose + 1e-3])
-    return fastest_rate(loop, [Recording(np.arange(2.0), q, q)])
+    return fastest_rate(loop, Recordings((Recording(np.arange(2.0), q, q),)))
 
 
 def random_references(
