@@ -243,7 +243,7 @@ def holds(certificate: Certificate, law: ComputedTorque) -> bool:
         return False
     # Balanced, since states of different units would hide a small eigenvalue behind a large one.
     size = np.sqrt(np.diag(c.P))
-    exact = np.abs(_left(law, c.mu, c.P, c.epsilon) - c.Q).max() <= 1e-9 * np.abs(c.Q).max()
+    exact = bool(np.abs(_left(law, c.mu, c.P, c.epsilon) - c.Q).max() <= 1e-9 * np.abs(c.Q).max())
     return exact and all(positive(x / np.outer(size, size)) for x in (c.P, c.Q))
 
 
