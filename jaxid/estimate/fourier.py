@@ -20,7 +20,8 @@ class FourierLS(AbstractMethod):
     - `period`: of the motion, s; found where None.
     - `harmonics`: how many; chosen where None.
     - `weights`: `"joint"` (each joint by its own deviation), or `"encoder"` (the covariance that
-      follows from the recordings' resolution).
+      follows from the recordings' resolution). To first order, and with what the series leaves out
+      taken for noise: deviations come out too large for fine encoders and too small for coarse.
     """
 
     period: float | None = eqx.field(static=True, default=None)

@@ -90,7 +90,7 @@ def margins_along(
 
 
 def _margins(design: Design, z: Float[Array, " numbers"]) -> Float[Array, "points kinds"]:
-    signals = design.basis @ design.coefficients(z)
+    signals = jnp.asarray(design.basis @ design.coefficients(z))
     tau = torque_along(design.loop, jnp.asarray(design.time), signals)
     rows, inside = margins_along(design.limits, signals, tau)
     return jnp.concatenate([rows.reshape(len(rows), -1), inside], axis=1)
@@ -118,7 +118,7 @@ def _feasible_share(
 
 @eqx.filter_jit
 def _information(design: Design, z: Float[Array, " numbers"]) -> Float[Array, "p p"]:
-    signals = design.sampled @ design.coefficients(z)
+    signals = jnp.asarray(design.sampled @ design.coefficients(z))
     noise = jnp.asarray(design.settings.noise)
     if design.settings.kind == "closed-loop":
         _, columns = closed_loop_columns(design.loop, design.samples, signals)
