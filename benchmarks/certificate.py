@@ -3,8 +3,8 @@
 Computed torque with PID on a two-link arm whose masses are known to a tenth. Every law is judged
 by the linear matrix inequality, then simulated (independent simulator, 2 ms ticks) from an error
 of 0.3 rad on arms with inertial parameters drawn inside the bound: it survives where the error at
-the end has fallen below a tenth (a slow law may be stable and not be there in 7 s). Without friction and gravity errors, which the certificate does
-not speak of, and with them.
+the end has fallen below a tenth; a slow law may be stable and not be there in 7 s. Without friction
+and gravity errors, which the certificate does not speak of, and with them.
 
 python -m benchmarks.certificate [--quick] [--json FILE]
 """

@@ -283,7 +283,7 @@ def _grid(joints: int) -> Float[np.ndarray, "points joints"]:
     if joints <= 2:
         axes = np.meshgrid(*[np.linspace(0.02, 0.98, 49)] * joints, indexing="ij")
         return np.concatenate([middle, np.stack([x.ravel() for x in axes], axis=1)])
-    return np.concatenate([middle, qmc.Sobol(joints, seed=0).random(4096)])
+    return np.concatenate([middle, qmc.Sobol(joints, scramble=False).random(4096)])
 
 
 def make_design(
