@@ -44,6 +44,7 @@ Column = Annotated[
 Unit = Annotated[
     list[str] | None, typer.Option("--unit", help="Unit of a signal that is not SI, as q=deg.")
 ]
+_METHODS = "oem, pem, idim, idim-iv, didim, integral, filtered, fourier or difference."
 Controller = Annotated[
     str | None,
     typer.Option(help="tracking (the real law is unknown) or open-loop (recorded torque)."),
@@ -187,7 +188,7 @@ def fit(
     column: Column = None,
     unit: Unit = None,
     controller: Controller = None,
-    method: Annotated[str, typer.Option(help="oem, pem, idim, idim-iv or didim.")] = "oem",
+    method: Annotated[str, typer.Option(help=_METHODS)] = "oem",
     window: Annotated[
         float | None, typer.Option(help="Simulate pieces of this length on their own, s.")
     ] = None,
@@ -205,6 +206,10 @@ def fit(
             "idim": estimate.IDIM,
             "idim-iv": estimate.IDIMIV,
             "didim": estimate.DIDIM,
+            "integral": estimate.IntegralLS,
+            "filtered": estimate.FilteredLS,
+            "fourier": estimate.FourierLS,
+            "difference": estimate.DifferenceLS,
         }
         if method not in methods:
             raise ModelError(f"there is no method {method!r}: choose {', '.join(methods)}")

@@ -37,6 +37,10 @@ class NoiseError(FitError):
         self.fit = fit
 
 
+class LimitsError(JaxidError, ValueError):
+    """Limits contradict each other, or leave no room for any motion."""
+
+
 class MissingExtraError(JaxidError, ImportError):
     """A package is needed that only an optional extra of jaxid installs."""
 

@@ -70,6 +70,11 @@ def parameter(
     return eqx.field(converter=as_float64, metadata={"parameter": declaration}, **extra)
 
 
+def known() -> Any:
+    """A field whose module is known: its parameters are numbers, none of the model's own."""
+    return eqx.field(metadata={"known": True})
+
+
 class Parameter(eqx.Module):
     """One parameter of a model: its declaration, its unique name and where it lives.
 
@@ -116,7 +121,7 @@ def _declared(module: Any, steps: tuple[str | int, ...]) -> Iterator[tuple[Any, 
         for field in dataclasses.fields(module):
             if "parameter" in field.metadata:
                 yield module, field.name, _Path((*steps, field.name))
-            elif not field.metadata.get("static", False):
+            elif not field.metadata.get("static") and not field.metadata.get("known"):
                 yield from _declared(getattr(module, field.name), (*steps, field.name))
 
 

@@ -195,7 +195,7 @@ def test_next_experiment_keeps_its_limits_and_separates(offset_story):
     diagnosis = story.steps[0].diagnosis
     pair = [v for v in diagnosis.ranking if v.key in (("torque_offset", 2), ("spring", 2))]
     proposed = diagnosis.next_experiment(effects=pair, tries=6, duration=6.0)
-    limits = jaxid.Limits.of(diagnosis)
+    limits = jaxid.Limits.of(diagnosis.fit.recordings)
     assert np.all(proposed.recording.q_ref >= limits.low - 1e-9)
     assert np.all(proposed.recording.q_ref <= limits.high + 1e-9)
     assert np.all(np.abs(proposed.recording.tau) <= 1.05 * limits.torque)

@@ -1,6 +1,7 @@
 """Rigid bodies: equations of motion in base parameters, one arm a file."""
 
 from ._base import AbstractArm as AbstractArm
+from ._base import Split as Split
 from .axis import Axis as Axis
 from .scara import SCARA as SCARA
 from .two_link import TwoLink as TwoLink

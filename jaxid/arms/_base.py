@@ -8,6 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..parameters import list_parameters, read_values, write_values
+
+
+class Split(eqx.Module):
+    """A regressor without accelerations: d²/dt² `second` + d/dt `first` + `zeroth`.
+
+    Each is `(joints, parameters)`. `second` holds positions alone, the others positions and
+    velocities (Li, Peng, Juang 2023).
+    """
+
+    second: Float[Array, "joints parameters"]
+    first: Float[Array, "joints parameters"]
+    zeroth: Float[Array, "joints parameters"]
+
 
 class AbstractArm(eqx.Module):
     """Rigid bodies: `tau = mass_matrix(q) a + bias(q, v)`, linear in the base parameters.
@@ -35,6 +49,30 @@ class AbstractArm(eqx.Module):
         self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
     ) -> Float[Array, "joints parameters"]:
         """Derivative of the torque by the base parameters, in the order of the fields."""
+
+    def split(self, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Split:
+        """The regressor in parts that need no acceleration.
+
+        By default from Lagrange's equations: momentum is what is differentiated, once. An arm
+        whose momentum has a part that is itself the rate of a position says so in its own.
+
+        **Arguments:**
+
+        - `q`, `v`: position and velocity, `(joints,)`, rad or m and per s.
+        """
+        parameters = list_parameters(self)
+
+        def momentum(values):
+            return write_values(self, parameters, values).mass_matrix(q) @ v
+
+        def rest(values):
+            arm = write_values(self, parameters, values)
+            kinetic = jax.grad(lambda at: 0.5 * v @ arm.mass_matrix(at) @ v)(q)
+            return arm.bias(q, jnp.zeros_like(v)) - kinetic
+
+        values = read_values(self, parameters)
+        first, zeroth = jax.jacfwd(momentum)(values), jax.jacfwd(rest)(values)
+        return Split(jnp.zeros_like(first), first, zeroth)
 
     def prismatic(self) -> tuple[bool, ...]:
         """Which joints slide, one a joint; the others turn."""

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..parameters import Scalar, parameter
-from ._base import AbstractArm
+from ._base import AbstractArm, Split
 
 
 class Axis(AbstractArm):
@@ -41,3 +41,8 @@ class Axis(AbstractArm):
     ) -> Float[Array, "joints parameters"]:
         """Force by M, `(1, 1)`."""
         return a[:, None]
+
+    def split(self, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Split:
+        """M a = d²/dt² (M q)."""
+        zero = jnp.zeros((1, 1))
+        return Split(q[:, None], zero, zero)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..parameters import Scalar, parameter
-from ._base import AbstractArm
+from ._base import AbstractArm, Split
 
 
 class SCARA(AbstractArm):
@@ -79,3 +79,13 @@ class SCARA(AbstractArm):
                 ),
             ]
         )
+
+    def split(self, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Split:
+        """The regressor in parts that need no acceleration, by (ZZ1r, ZZ2, MX2, MY2)."""
+        c, s = self.length * jnp.cos(q[1]), self.length * jnp.sin(q[1])
+        zero, both = jnp.zeros_like(c), q[0] + q[1]
+        swing, turn = 2 * v[0] + v[1], v[0] * (v[0] + v[1])
+        second = [[q[0], both, zero, zero], [zero, both, zero, zero]]
+        first = [[zero, zero, swing * c, -swing * s], [zero, zero, v[0] * c, -v[0] * s]]
+        zeroth = [[zero] * 4, [zero, zero, turn * s, turn * c]]
+        return Split(jnp.array(second), jnp.array(first), jnp.array(zeroth))

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from ..errors import ModelError
 from ..parameters import Scalar, parameter
-from ._base import AbstractArm
+from ._base import AbstractArm, Split
 
 
 class TwoLink(AbstractArm):
@@ -103,3 +103,23 @@ class TwoLink(AbstractArm):
         else:
             columns.append(coupled)
         return jnp.stack(columns, axis=1)
+
+    def split(self, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Split:
+        """The regressor in parts that need no acceleration, by (p1, p2, p4, p5[, p3])."""
+        c, s = jnp.cos(q[1]), jnp.sin(q[1])
+        zero, both = jnp.zeros_like(c), q[0] + q[1]
+        outer = self.g * jnp.sin(both)
+        nothing = jnp.zeros((2, 4))
+        second = jnp.array([[q[0], both, zero, zero], [zero, both, zero, zero]])
+        zeroth = jnp.array([[zero, zero, self.g * jnp.sin(q[0]), outer], [zero] * 3 + [outer]])
+        momentum = jnp.stack([(2 * v[0] + v[1]) * c, v[0] * c])
+        swing = jnp.stack([zero, v[0] * (v[0] + v[1]) * s])
+        if self.p3 is None:
+            assert self.link_length is not None
+            first = nothing.at[:, 3].set(self.link_length * momentum)
+            return Split(second, first, zeroth.at[:, 3].add(self.link_length * swing))
+        return Split(
+            jnp.pad(second, ((0, 0), (0, 1))),
+            jnp.concatenate([nothing, momentum[:, None]], axis=1),
+            jnp.concatenate([zeroth, swing[:, None]], axis=1),
+        )

@@ -7,5 +7,4 @@ from .diagnose import diagnose as diagnose
 from .discover import Discovery as Discovery
 from .discover import discover as discover
 from .experiment import Experiment as Experiment
-from .experiment import Limits as Limits
 from .experiment import next_experiment as next_experiment

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from .. import figures
 from ..effects import AbstractTransmission
 from ..errors import FitError
+from ..excitation import Limits
 from ..loop import ClosedLoop
 from ..recording import Recording
 from ..simulate import prepare, with_substeps
@@ -17,37 +18,6 @@ from .diagnose import Diagnosis, Verdict, _at_samples
 from .linear import base_columns, linearise
 from .score import Data, Gram
 from .signatures import signatures
-
-
-class Limits(eqx.Module):
-    """What a reference and its motion may not exceed, one value a joint, in SI units.
-
-    - `low`, `high`: of position. `speed`, `acceleration`, `torque`: magnitudes.
-    """
-
-    low: Float[np.ndarray, " joints"]
-    high: Float[np.ndarray, " joints"]
-    speed: Float[np.ndarray, " joints"]
-    acceleration: Float[np.ndarray, " joints"]
-    torque: Float[np.ndarray, " joints"]
-
-    @classmethod
-    def of(cls, diagnosis: Diagnosis) -> "Limits":
-        """What the recordings at hand have reached."""
-        scene, recordings = diagnosis.scene, diagnosis.fit.recordings
-        asked = [r.q if r.q_ref is None else r.q_ref for r in recordings]
-        speed, acceleration = [], []
-        for q, r in zip(asked, recordings, strict=True):
-            v = np.gradient(q, r.time, axis=0)
-            speed.append(np.abs(v).max(axis=0))
-            acceleration.append(np.abs(np.gradient(v, r.time, axis=0)).max(axis=0))
-        return cls(
-            scene.q_low,
-            scene.q_high,
-            np.max(speed, axis=0),
-            np.max(acceleration, axis=0),
-            scene.torque,
-        )
 
 
 class Experiment(eqx.Module):
@@ -108,7 +78,7 @@ def next_experiment(
     chosen = [v for v in chosen if not isinstance(v.hypothesis.effect, AbstractTransmission)]
     if not chosen:
         raise FitError("there is no effect whose signature can be predicted on another reference")
-    bounds = Limits.of(diagnosis) if limits is None else limits
+    bounds = Limits.of(diagnosis.fit.recordings) if limits is None else limits
     loop = with_substeps(diagnosis.fit.loop, diagnosis.fit.recordings)
     period = float(np.median([r.period for r in diagnosis.fit.recordings]))
     drawn = [

@@ -26,7 +26,7 @@ class Stacked(eqx.Module):
     scales: Float[np.ndarray, " parameters"]
     lengths: tuple[int, ...] = eqx.field(static=True)
 
-    def split(self, rows: Float[np.ndarray, "samples joints"]) -> list[np.ndarray]:
+    def split(self, rows: Float[np.ndarray, "samples *axes"]) -> list[np.ndarray]:
         """Rows by recording."""
         return np.split(rows, np.cumsum(self.lengths)[:-1])
 

@@ -1,5 +1,6 @@
 """Robot simulator that shares no code with jaxid, to check jaxid with what it did not make."""
 
+from .batch import Batch, SampledComputedTorque, simulate_batch
 from .cases import (
     Case,
     calibrate,
@@ -33,12 +34,14 @@ __all__ = [
     "OUTSIDE",
     "PD",
     "Axis",
+    "Batch",
     "Case",
     "Effect",
     "EmpsCascade",
     "MultiSine",
     "Noise",
     "OpenLoop",
+    "SampledComputedTorque",
     "SampledPD",
     "Scale",
     "Scara",
@@ -62,6 +65,7 @@ __all__ = [
     "remaining_in_inverse_dynamics",
     "robot_controller",
     "simulate",
+    "simulate_batch",
     "truth",
     "visibility",
     "write_case",

@@ -1,0 +1,97 @@
+"""Computed torque with a PID law on a model that is not quite the arm."""
+
+from typing import Protocol, runtime_checkable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..parameters import known
+from ._base import AbstractController, Reading, Reference
+from .pd import _vector
+
+
+@runtime_checkable
+class Body(Protocol):
+    """Equations of motion that a law may hold for the arm's."""
+
+    def mass_matrix(self, q: Float[Array, " joints"]) -> Float[Array, "joints joints"]:
+        """Inertia at q."""
+        ...
+
+    def bias(
+        self, q: Float[Array, " joints"], v: Float[Array, " joints"]
+    ) -> Float[Array, " joints"]:
+        """Torque besides that of the acceleration."""
+        ...
+
+
+class ComputedTorque(AbstractController):
+    """tau = M̂ (a_ref + Kd e' + Kp e + Ki ∫e) + ĥ(q, v), with e = q_ref - q.
+
+    M̂ and ĥ are those of `model`, whose values a fit leaves alone (Li, Peng, Juang 2023).
+
+    **Arguments:**
+
+    - `model`: what the law takes the arm for.
+    - `Kp`, `Ki`, `Kd`: gains, `(joints,)`, 1/s², 1/s³ and 1/s.
+    - `every`: period, s, of a law that computes with encoders alone: velocity is the difference
+      of readings `window` ticks apart, and the torque holds until the next tick. None for a
+      continuous law that is given velocities.
+    - `window`: ticks.
+    """
+
+    model: Body = known()
+    Kp: Float[Array, " joints"] = eqx.field(converter=_vector)
+    Ki: Float[Array, " joints"] = eqx.field(converter=_vector)
+    Kd: Float[Array, " joints"] = eqx.field(converter=_vector)
+    every: float | None = eqx.field(static=True, default=None)
+    window: int = eqx.field(static=True, default=1)
+
+    @property
+    def period(self) -> float | None:
+        """Time between two ticks, s; None for a continuous law."""
+        return self.every
+
+    def initial_state(self, reading: Reading) -> Float[Array, " states"]:
+        """No integral; of a sampled law also no torque yet, and the last readings, newest first."""
+        zero = jnp.zeros_like(reading.q)
+        if self.every is None:
+            return zero
+        past = [reading.q - k * self.every * reading.v for k in range(1, self.window + 1)]
+        return jnp.concatenate([zero, zero, *past])
+
+    def _law(self, reading: Reading, reference: Reference, integral) -> Float[Array, " joints"]:
+        error, rate = reference.q - reading.q, reference.v - reading.v
+        asked = reference.a + self.Kd * rate + self.Kp * error + self.Ki * integral
+        torque = self.model.mass_matrix(reading.q) @ asked
+        return torque + self.model.bias(reading.q, reading.v) + reference.tau
+
+    def derivative(
+        self, reading: Reading, reference: Reference, state: Float[Array, " states"]
+    ) -> Float[Array, " states"]:
+        """The error, of a continuous law."""
+        return jnp.zeros_like(state) if self.every else reference.q - reading.q
+
+    def tick(
+        self, reading: Reading, reference: Reference, state: Float[Array, " states"]
+    ) -> Float[Array, " states"]:
+        """Integral, the torque to hold, and the readings."""
+        assert self.every is not None
+        integral, _, *past = jnp.split(state, 2 + self.window)
+        seen = Reading(reading.q, (reading.q - past[-1]) / (self.window * self.every))
+        integral = integral + self.every * (reference.q - reading.q)
+        torque = self._law(seen, reference, integral)
+        return jnp.concatenate([integral, torque, reading.q, *past[:-1]])
+
+    def command(
+        self,
+        reading: Reading,
+        reference: Reference,
+        state: Float[Array, " states"],
+        mass: Float[Array, "joints joints"],
+    ) -> Float[Array, " joints"]:
+        """The law's torque, `(joints,)`, N·m or N; of a sampled law the one that holds."""
+        if self.every is None:
+            return self._law(reading, reference, state)
+        return jnp.split(state, 2 + self.window)[1]

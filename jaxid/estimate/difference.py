@@ -1,0 +1,34 @@
+"""Direct differences: what every other method is better than."""
+
+import equinox as eqx
+
+from ..loop import ClosedLoop
+from ..recording import Recording, Recordings
+from ._base import AbstractMethod, Fit
+from ._split import EncoderWeights, fit_rows, motion_rows
+from .states import AbstractStates, Differences
+
+
+class DifferenceLS(AbstractMethod):
+    """Least squares along velocity and acceleration by differences, without any filter.
+
+    The direct difference model of Li, Peng and Juang 2023: encoder steps show multiplied by 1/T
+    and 1/T².
+
+    **Arguments:**
+
+    - `states`: which differences.
+    - `weights`: `"joint"` (each joint by its own deviation), or `"encoder"` (the covariance that
+      follows from the recordings' resolution).
+    """
+
+    states: AbstractStates = Differences()
+    weights: EncoderWeights = eqx.field(static=True, default="joint")
+
+    def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
+        """Estimates the parameters in which torque is linear; called by `jaxid.fit`."""
+
+        def rows(recording: Recording):
+            return motion_rows(loop, recording, self.states)
+
+        return fit_rows(loop, recordings, self, self.weights, rows)

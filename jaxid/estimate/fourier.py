@@ -1,0 +1,38 @@
+"""Least squares along a Fourier series fitted to periodic motion."""
+
+import equinox as eqx
+
+from ..loop import ClosedLoop
+from ..recording import Recording, Recordings
+from ._base import AbstractMethod, Fit
+from ._split import EncoderWeights, fit_rows, motion_rows
+from .states import FourierStates
+
+
+class FourierLS(AbstractMethod):
+    """Least squares along the position, velocity and acceleration of a fitted Fourier series.
+
+    For periodic excitation (Swevers et al. 1997; Li, Peng, Juang 2023). The number of harmonics is
+    chosen by BIC, joints weighted by their encoder's errors.
+
+    **Arguments:**
+
+    - `period`: of the motion, s; found where None.
+    - `harmonics`: how many; chosen where None.
+    - `weights`: `"joint"` (each joint by its own deviation), or `"encoder"` (the covariance that
+      follows from the recordings' resolution). To first order, and with what the series leaves out
+      taken for noise: deviations come out too large for fine encoders and too small for coarse.
+    """
+
+    period: float | None = eqx.field(static=True, default=None)
+    harmonics: int | None = eqx.field(static=True, default=None)
+    weights: EncoderWeights = eqx.field(static=True, default="joint")
+
+    def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
+        """Estimates the parameters in which torque is linear; called by `jaxid.fit`."""
+        states = FourierStates(self.period, self.harmonics)
+
+        def rows(recording: Recording):
+            return motion_rows(loop, recording, states)
+
+        return fit_rows(loop, recordings, self, self.weights, rows)

@@ -1,0 +1,56 @@
+"""The integral method: a second-order integral operator in place of every derivative."""
+
+import math
+from typing import Literal
+
+import equinox as eqx
+
+from ..loop import ClosedLoop
+from ..recording import Recording, Recordings
+from ..smoothing import signal_cutoff
+from ._base import AbstractMethod, Fit
+from ._operators import Operator
+from ._split import EncoderWeights, fit_rows, split_rows
+from .states import AbstractStates, LowPass
+
+
+def default_pole(recording: Recording) -> float:
+    """Where the recorded motion's spectrum sinks into noise, 1/s."""
+    return min(2 * math.pi * signal_cutoff(recording), 0.3 * math.pi * recording.rate)
+
+
+class IntegralLS(AbstractMethod):
+    """Least squares on the split regression through a second-order integral operator.
+
+    Every term passes F(s) = λ1 λ2 / ((s + λ1)(s + λ2)), and what would be differentiated once or
+    twice passes s F(s) or s² F(s) instead, integrated exactly over each sample: no acceleration is
+    needed, and position alone makes the inertial terms (Li, Peng, Juang 2023, equation (42) and
+    Appendix A).
+
+    **Arguments:**
+
+    - `lambda1`, `lambda2`: poles, 1/s; by default where the motion's spectrum sinks into noise.
+    - `transient`: the operator's answer to its unknown initial state is `"modelled"` by two
+      columns a joint, `"dropped"` with the first ten time constants, or `"ignored"`.
+    - `states`: where velocities come from.
+    - `weights`: `"joint"` (each joint by its own deviation), or `"encoder"` (Appendix C: the
+      covariance that follows from the recordings' resolution).
+    """
+
+    lambda1: float | None = eqx.field(static=True, default=None)
+    lambda2: float | None = eqx.field(static=True, default=None)
+    transient: Literal["modelled", "dropped", "ignored"] = eqx.field(
+        static=True, default="modelled"
+    )
+    states: AbstractStates = LowPass()
+    weights: EncoderWeights = eqx.field(static=True, default="joint")
+
+    def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
+        """Estimates the parameters in which torque is linear; called by `jaxid.fit`."""
+
+        def rows(recording: Recording):
+            first = self.lambda1 or self.lambda2 or default_pole(recording)
+            operator = Operator.of((first, self.lambda2 or first), recording)
+            return split_rows(loop, recording, self, self.states, operator, self.transient)
+
+        return fit_rows(loop, recordings, self, self.weights, rows)

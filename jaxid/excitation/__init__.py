@@ -1,0 +1,6 @@
+"""Reference trajectories and their optimal design."""
+
+from .limits import Limits as Limits
+from .limits import PlanarReach as PlanarReach
+from .optimal import Excitation as Excitation
+from .optimal import optimal_excitation as optimal_excitation

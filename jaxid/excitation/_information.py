@@ -1,0 +1,146 @@
+"""What a reference would tell about the parameters: information matrices, differentiable."""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..effects import Motion
+from ..estimate._regression import linear_parameters, mismatch
+from ..loop import ClosedLoop
+from ..parameters import Parameter, read_values, write_values
+from ..simulate import NOBODY, Interval, initial, run_with_sensitivities
+
+Kind = Literal["inverse-dynamics", "closed-loop"]
+
+
+def along(time: Float[Array, " points"], signals: Float[Array, "3 points joints"]) -> Motion:
+    """Position, velocity and acceleration as effects see them, without torque."""
+    n = time.shape[0]
+    q, v, a = signals
+    zero = jnp.zeros_like(q)
+    return jax.vmap(Motion)(time, q, v, a, zero, jnp.zeros((n, 0)), jnp.full(n, NOBODY))
+
+
+@eqx.filter_jit
+def torque_along(
+    loop: ClosedLoop, time: Float[Array, " points"], signals: Float[Array, "3 points joints"]
+) -> Float[Array, "points joints"]:
+    """Torque that a motion takes."""
+    return mismatch(loop, along(time, signals))
+
+
+def chosen_parameters(loop: ClosedLoop, kind: Kind) -> tuple[Parameter, ...]:
+    """Which parameters are to be determined: with inverse dynamics, those that are linear."""
+    return linear_parameters(loop) if kind == "inverse-dynamics" else loop.free_parameters
+
+
+@eqx.filter_jit
+def inverse_columns(
+    loop: ClosedLoop, time: Float[Array, " points"], signals: Float[Array, "3 points joints"]
+) -> Float[Array, "points joints parameters"]:
+    """The inverse-dynamics regressor along a motion."""
+    chosen = linear_parameters(loop)
+
+    def torque(values):
+        return torque_along(write_values(loop, chosen, values), time, signals)
+
+    return jax.jacfwd(torque)(read_values(loop, chosen))
+
+
+def intervals_of(
+    loop: ClosedLoop,
+    time: Float[Array | np.ndarray, " points"],
+    signals: Float[Array, "3 points joints"],
+) -> Interval:
+    """A reference as the simulation takes it: cubics that meet positions and velocities."""
+    q, v, _ = signals
+    h = jnp.append(jnp.diff(jnp.asarray(time)), 0.0)
+    safe = jnp.where(h > 0, h, 1.0)[:, None]
+    move = jnp.append(jnp.diff(q, axis=0), jnp.zeros_like(q[:1]), axis=0) / safe
+    then = jnp.append(v[1:], v[-1:], axis=0)
+    second = (3 * move - 2 * v - then) / safe
+    third = (v + then - 2 * move) / safe**2
+    n, joints = q.shape
+    # A sampled law ticks at every point of the grid but the last.
+    ticks = jnp.arange(n) < n - 1
+    return jax.vmap(Interval)(
+        jnp.asarray(time),
+        h,
+        ticks,
+        jnp.full(n, NOBODY),
+        jnp.stack([q, v, second, third], axis=1),
+        jnp.zeros((n, 2, joints)),
+    )
+
+
+@eqx.filter_jit
+def closed_loop_columns(
+    loop: ClosedLoop,
+    time: Float[Array | np.ndarray, " points"],
+    signals: Float[Array, "3 points joints"],
+) -> tuple[Float[Array, "points 3 joints"], Float[Array, "points joints parameters"]]:
+    """Torque, position and velocity of the loop that tracks a reference from rest at its start.
+
+    **Returns:** `(points, 3, joints)`, and the derivative of torque by the free parameters.
+    """
+    intervals = intervals_of(loop, time, signals)
+    q0, v0 = signals[0, 0], jnp.zeros_like(signals[0, 0])
+    theta = loop.theta
+
+    def begin(values):
+        return initial(loop.with_theta(values), intervals, q0, v0)
+
+    x0, start = begin(theta), jax.jacfwd(begin)(theta)
+    seen, by = run_with_sensitivities(loop, intervals, x0, start, (0, 1, 2))
+    return seen, by[:, 0]
+
+
+def information_of(
+    columns: Float[Array, "points joints parameters"], noise: Float[Array, " joints"]
+) -> Float[Array, "parameters parameters"]:
+    """Information of white torque noise of these deviations, `(joints,)`."""
+    scaled = columns / noise[:, None]
+    return jnp.einsum("kjp,kjq->pq", scaled, scaled)
+
+
+def log_deviation(
+    information: Float[Array, "parameters parameters"], scales: Float[Array, " parameters"]
+) -> Float[Array, ""]:
+    """Logarithm of the geometric mean of the deviations, each in units of its scale.
+
+    With correlations in it: half the log det of the covariance, by parameter.
+    """
+    p = information.shape[0]
+    scaled = information * jnp.outer(scales, scales)
+    size = jnp.sqrt(jnp.diag(scaled))
+    size = jnp.where(size > 0, size, 1.0)
+    correlated = scaled / jnp.outer(size, size)
+    # What cannot be told apart has no deviation; a floor at rounding keeps the search going.
+    value = jnp.linalg.slogdet(correlated + 1e-13 * jnp.eye(p))[1] + 2 * jnp.sum(jnp.log(size))
+    return -value / (2 * p)
+
+
+def log_condition(
+    information: Float[Array, "parameters parameters"], scales: Float[Array, " parameters"]
+) -> Float[Array, ""]:
+    """Logarithm of the condition number of the columns, each in units of its scale."""
+    values = jnp.linalg.eigvalsh(information * jnp.outer(scales, scales))
+    return 0.5 * jnp.log(values[-1] / jnp.maximum(values[0], 1e-13 * values[-1]))
+
+
+class Settings(eqx.Module):
+    """How references are judged: which information, which criterion, how much noise."""
+
+    kind: Kind = eqx.field(static=True)
+    criterion: Literal["deviation", "condition"] = eqx.field(static=True)
+    noise: Float[np.ndarray, " joints"]
+    scales: Float[np.ndarray, " parameters"]
+
+    def judge(self, information: Float[Array, "parameters parameters"]) -> Float[Array, ""]:
+        """The criterion, to be made small."""
+        by = log_deviation if self.criterion == "deviation" else log_condition
+        return by(information, jnp.asarray(self.scales))
