@@ -349,11 +349,13 @@ class _Search(eqx.Module):
         """The starting model, fitted and diagnosed."""
         say("fit of the starting model")
         first = fit(loop, self.recordings, _quiet(self.method))
-        # Where noise is strongly coloured, plain output error leaves the parameters so far off
-        # that what follows would have to explain that.
-        again = fit(first.loop, self.recordings, self.alternating())
         say("diagnosis of the starting model")
-        return self.step("start", again if again.succeeded else first)
+        step = self.step("start", first)
+        # With the noise known, once more: where it is strongly coloured, plain output error leaves
+        # the parameters so far off that what follows would have to explain that. A filter fitted to
+        # the residual itself would take what is missing for noise, and the model further off.
+        again = fit(first.loop, self.recordings, self.whitened_method(step.diagnosis))
+        return self.step("start", again) if again.succeeded else step
 
     def step(self, label: str, found: Fit, **extra: Any) -> Step:
         """A step with its diagnosis and its error on held-out recordings."""

@@ -22,7 +22,7 @@ from ._encoder import Kernels, errors_of, row_errors, solve_weighted
 from ._operators import Operator
 from ._regression import effect_states, linear_parameters, regression
 from .idim import Solved, Stacked, regression_fit, solve
-from .oem import score_covariance
+from .deviations import score_covariance
 from .states import AbstractStates
 
 EncoderWeights = Literal["joint", "encoder"]
