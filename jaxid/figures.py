@@ -28,6 +28,7 @@ MAX_LEGEND = 9
 INK = "#7b818b"
 GRID = "rgba(128,134,145,0.22)"
 SHADE = "rgba(128,134,145,0.20)"
+MISFIT = "rgba(216,69,90,0.20)"
 BLUE, ORANGE, GREEN, PURPLE, RED = "#2f86dd", "#dd7320", "#219b73", "#9a66d8", "#d8455a"
 PALETTE = (BLUE, ORANGE, GREEN, PURPLE, RED, "#96891c", "#c458a6", INK)
 DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
@@ -183,10 +184,38 @@ def comparison(
         figure.update_yaxes(title_text="autocorrelation", range=[-reach, reach], row=row, col=2)
         drawn += upper + lower
     _shade_gaps(figure, time, drawn)
-    figure.update_xaxes(matches="x", showticklabels=False, col=1)
+    for row in range(1, 2 * joints + 1):
+        # An axis that matches itself is what plotly warns of in a browser's console.
+        figure.update_xaxes(matches="x" if row > 1 else None, showticklabels=False, row=row, col=1)
     figure.update_xaxes(title_text="time (s)", showticklabels=True, row=2 * joints, col=1)
-    figure.update_xaxes(title_text="lag (samples)", row=2 * joints - 1, col=2)
+    figure.update_xaxes(showticklabels=False, col=2)
+    last: dict[str, Any] = {"row": 2 * joints - 1, "col": 2}
+    figure.update_xaxes(title_text="lag (samples)", showticklabels=True, **last)
     return _finish(figure, title, height=140 + 290 * joints, legend=True)
+
+
+def mark_misfit(
+    figure: go.Figure, joint: int, spans: Sequence[tuple[float, float]], name: str = "misfit"
+) -> go.Figure:
+    """Shade stretches of one joint in a comparison; the longest 40 are drawn.
+
+    Arguments:
+        figure: What `comparison` gave; it is changed.
+        joint: Counted from 1.
+        spans: Start and end of each stretch, s.
+        name: What the legend calls them.
+    """
+    longest = sorted(spans, key=lambda span: span[0] - span[1])[:MAX_GAPS]
+    for row in (2 * joint - 1, 2 * joint):
+        cell: dict[str, Any] = {"row": row, "col": 1}
+        for start, end in longest:
+            edges = {"x0": float(start), "x1": float(end), "line": {"width": 0}}
+            figure.add_vrect(fillcolor=MISFIT, layer="below", **edges, **cell)
+    present: Any = figure.data
+    if longest and all(trace.name != name for trace in present):
+        square = {"symbol": "square", "size": 12, "color": MISFIT}
+        figure.add_scatter(x=[None], y=[None], name=name, mode="markers", marker=square)
+    return figure
 
 
 def error_bars(

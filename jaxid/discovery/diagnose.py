@@ -26,6 +26,7 @@ from ..parameters import write_values
 from ..progress import working
 from ..recording import Recordings
 from ..saved import save
+from ..showing import AbstractShown
 from ..simulate import Batch, prepare, with_substeps
 from .compare import Comparison
 from .linear import Linearised, base_columns, linearise
@@ -60,7 +61,7 @@ class Verdict(eqx.Module):
         return self.hypothesis.name, self.hypothesis.joint
 
 
-class Diagnosis(eqx.Module):
+class Diagnosis(AbstractShown):
     """Where a fitted model fails and which effects may be missing, ranked.
 
     - `ranking`: the catalogue's entries, each at its best setting, best first.
@@ -151,10 +152,15 @@ class Diagnosis(eqx.Module):
         total = self.gram.rest
         for verdict in self.ranking:
             values, stds = self.amplitude(verdict)
-            symbols = [n for p in amplitudes(verdict.hypothesis.effect) for n in p.names]
-            symbols = symbols or ["setting"]
+            shown = [
+                (name, self.fit.loop.unit(p))
+                for p in amplitudes(verdict.hypothesis.effect)
+                for name in p.names
+            ]
+            rows_of = zip(shown or [("setting", "1")], values, stds, strict=True)
             size = ", ".join(
-                f"{s} {v:.3g} ± {d:.1g}" for s, v, d in zip(symbols, values, stds, strict=True)
+                f"{s} {v:.3g} ± {d:.1g}{'' if unit == '1' else f' {unit}'}"
+                for (s, unit), v, d in rows_of
             )
             error = self.predicted_error(verdict) if verdict.p_value < 0.05 else None
             rows.append(

@@ -18,6 +18,7 @@ from .. import figures
 from ..loop import ClosedLoop
 from ..recording import Recording, Recordings
 from ..saved import save
+from ..showing import AbstractShown
 
 
 class Status(enum.Enum):
@@ -29,7 +30,7 @@ class Status(enum.Enum):
     diverged = "no parameter values were found at which the loop can be simulated"
 
 
-class Fit(eqx.Module):
+class Fit(AbstractShown):
     """What an estimate gave: a loop with its parameters, how sure they are, and how it went.
 
     - `loop`: the model with the estimated values.
