@@ -337,6 +337,7 @@ def curve_fit(
     band: Float[np.ndarray, " points"] | None = None,
     *,
     y_name: str = "residual",
+    curve_name: str = "fitted curve",
     title: str | None = None,
 ) -> go.Figure:
     """Draw a residual against a coordinate, with a fitted curve and its confidence band.
@@ -351,6 +352,7 @@ def curve_fit(
         curve: Fitted curve in `y_unit`, shape `(points,)`.
         band: Half-width of the confidence band in `y_unit`, shape `(points,)`.
         y_name: What is drawn upwards.
+        curve_name: What the legend calls the curve.
         title: Of the whole figure.
     """
     figure = go.Figure()
@@ -362,10 +364,44 @@ def curve_fit(
     if band is not None:
         figure.add_trace(_band_trace("confidence band", curve_x, curve - band, curve + band))
     line = {"color": BLUE, "width": 2.6}
-    figure.add_scatter(x=curve_x, y=curve, name="fitted curve", mode="lines", line=line)
+    figure.add_scatter(x=curve_x, y=curve, name=curve_name, mode="lines", line=line)
     figure.update_xaxes(title_text=_with_unit(x_name, x_unit))
     figure.update_yaxes(title_text=_with_unit(y_name, y_unit))
     return _finish(figure, title, height=400, legend=True)
+
+
+def dependence(
+    x: Float[np.ndarray, " samples"],
+    y: Float[np.ndarray, " samples"],
+    x_name: str,
+    x_unit: str,
+    y_unit: str,
+    *,
+    y_name: str = "residual",
+    title: str | None = None,
+) -> go.Figure:
+    """Draw a residual against a coordinate, with its mean in stretches of equal count.
+
+    The band is two standard errors either side, as of independent samples.
+
+    Arguments:
+        x: Coordinate in `x_unit`, shape `(samples,)`.
+        y: Residual in `y_unit`, shape `(samples,)`.
+        x_name: What the coordinate is, such as "velocity of joint 2".
+        x_unit: Unit, as printed.
+        y_unit: Unit, as printed.
+        y_name: What is drawn upwards.
+        title: Of the whole figure.
+    """
+    order = np.array_split(np.argsort(x, kind="stable"), max(2, min(30, len(x) // 20)))
+    middle = np.array([np.median(x[k]) for k in order])
+    mean = np.array([np.mean(y[k]) for k in order])
+    error = np.array([2 * np.std(y[k]) / np.sqrt(len(k)) for k in order])
+    # A coordinate that stands still gives several stretches one place, which a line cannot have.
+    distinct = np.append(True, np.diff(middle) > 0)
+    line = middle[distinct], mean[distinct], error[distinct]
+    names = {"y_name": y_name, "curve_name": "mean", "title": title}
+    return curve_fit(x, y, x_name, x_unit, y_unit, *line, **names)
 
 
 def parameters(

@@ -7,7 +7,7 @@ from scipy.ndimage import uniform_filter1d
 
 from .. import figures
 from ..discovery import Comparison, Discovery, compare
-from ..discovery.diagnose import Verdict
+from ..discovery.diagnose import Verdict, coordinate_unit
 from ..discovery.discover import Step
 from ..discovery.score import whitened
 from ..effects import Curve
@@ -79,48 +79,24 @@ def against(held: Comparison, where: Verdict, model: str) -> Markup:
         x.append(np.asarray(way)[kept])
         sign = np.sign(np.asarray(run.v)[kept, joint - 1]) if curve.signed else 1.0
         y.append(rest[:, joint - 1] * sign)
-    name, unit = curve.spoken_coordinate, _unit(held, curve)
+    name = curve.spoken_coordinate
     signed = " × sign of velocity" if curve.signed else ""
     torque, position = held.loop.arm.units()
-    y_unit = (position if held.signal == "position" else torque)[joint - 1]
-    middle, mean, band = _means(np.concatenate(x), np.concatenate(y))
-    drawn = figures.curve_fit(
+    drawn = figures.dependence(
         np.concatenate(x),
         np.concatenate(y),
         name,
-        unit,
-        y_unit,
-        middle,
-        mean,
-        band,
+        coordinate_unit(curve, torque, position),
+        (position if held.signal == "position" else torque)[joint - 1],
         y_name=f"residual of joint {joint}{signed}",
     )
+    on = name if curve.coordinate == "t" else f"the {name}"
     return figure(
         drawn,
-        f"What {model} leaves of joint {joint}'s {held.signal}{signed}, against the {name}. A "
-        "model that lacks nothing leaves a flat line. The line is the mean in stretches of equal "
-        "count, the band two standard errors of independent samples.",
+        f"What {model} leaves of joint {joint}'s {held.signal}{signed}, against {on}. A model that "
+        "lacks nothing leaves a flat line. The line is the mean in stretches of equal count, the "
+        "band two standard errors of independent samples.",
     )
-
-
-def _unit(held: Comparison, curve: Curve) -> str:
-    if curve.coordinate == "t":
-        return "s"
-    torque, position = held.loop.arm.units()
-    if curve.coordinate == "tau":
-        return torque[curve.of - 1]
-    return position[curve.of - 1] + {"v": "/s", "a": "/s²"}.get(curve.coordinate, "")
-
-
-def _means(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean of y in stretches of x of equal count, and two standard errors."""
-    order = np.array_split(np.argsort(x, kind="stable"), max(2, min(30, len(x) // 20)))
-    middle = np.array([np.median(x[k]) for k in order])
-    mean = np.array([np.mean(y[k]) for k in order])
-    error = np.array([2 * np.std(y[k]) / np.sqrt(len(k)) for k in order])
-    # A coordinate that stands still gives several stretches one place, which a line cannot have.
-    distinct = np.append(True, np.diff(middle) > 0)
-    return middle[distinct], mean[distinct], error[distinct]
 
 
 def whiteness(story: Discovery, held: Comparison, recording: int) -> list[Markup]:
