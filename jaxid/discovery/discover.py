@@ -438,12 +438,12 @@ class _Search(eqx.Module):
         return gained > 0 and not _curve_is_better(last.diagnosis, gained)
 
     def refit(
-        self, last: Step, leading: Sequence[Verdict], say: Callable[[str], None]
+        self, last: Step, leading: Sequence[Verdict], say: Callable[..., None]
     ) -> list[Contender]:
         """The leading entries as full nonlinear models, best first."""
         found = []
-        for verdict in leading:
-            say(f"refit with {_name(*verdict.key)}")
+        for k, verdict in enumerate(leading):
+            say(f"refit with {_name(*verdict.key)}, {k + 1} of {len(leading)}", k / len(leading))
             # What was screened at a finite setting may start in another valley at its prediction.
             starts = [last.diagnosis.predicted(verdict)]
             if not amplitudes(verdict.hypothesis.effect):
