@@ -80,9 +80,9 @@ def draw(diagnosis: jaxid.Diagnosis, verdict: Verdict) -> go.Figure:
     if curve.signed:
         y = y * np.sign(np.asarray(motion.v)[..., joint - 1][mask])
     figure = make_subplots(rows=1, cols=2, column_widths=[0.6, 0.4], horizontal_spacing=0.09)
-    time = diagnosis.fit.recordings[recording].time
+    time, first = diagnosis.fit.recordings[recording].time, wave[recording, mask[recording]]
     line = {"color": figures.ORANGE, "width": 1.6}
-    figure.add_scatter(x=time, y=wave[recording, mask[recording], joint - 1], mode="lines", line=line)
+    figure.add_scatter(x=time, y=first[:, joint - 1], mode="lines", line=line)
     dots = {"color": figures.BLUE, "size": 3, "opacity": 0.5}
     few = np.random.default_rng(0).permutation(len(x))[:600]
     figure.add_scatter(x=x[few], y=y[few], mode="markers", marker=dots, row=1, col=2)

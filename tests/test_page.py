@@ -15,7 +15,8 @@ pytestmark = [pytest.mark.xdist_group("demo"), pytest.mark.slow]
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 DRAWN = """() => [...document.querySelectorAll("[data-figure]")].every(
     (box) => box.querySelector(".main-svg .plot, .main-svg .cartesianlayer path"))"""
-RANGES = """() => [...document.querySelectorAll("[data-linked]")].map((box) => box.layout.xaxis.range)"""
+RANGES = """() => [...document.querySelectorAll("[data-linked]")].map(
+    (box) => box.layout.xaxis.range)"""
 
 
 @pytest.fixture(scope="module")
