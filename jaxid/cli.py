@@ -200,7 +200,7 @@ def _sentences(on_interrupt: Callable[[], str] = str) -> Iterator[None]:
             typer.echo(f"jaxid: {error}", err=True)
             raise typer.Exit(2) from None
         except KeyboardInterrupt:
-            typer.echo(f"\njaxid: interrupted{on_interrupt()}", err=True)
+            _part()
             raise typer.Exit(INTERRUPTED) from None
 
 
@@ -520,7 +520,16 @@ def _keep_programs() -> None:
 
 
 # What an interrupt does and says beside that it was one; a command in progress sets it.
-_farewell: list[Callable[[], str]] = [str]
+_farewell: list[Callable[[], str] | None] = [str]
+_parting = threading.Lock()
+
+
+def _part() -> None:
+    """Says that it was an interrupt, once, whichever thread comes first; the other waits for it."""
+    with _parting:
+        farewell, _farewell[0] = _farewell[0], None
+        if farewell is not None:
+            typer.echo(f"\njaxid: interrupted{farewell()}", err=True)
 
 
 def _leave_on_interrupt() -> None:
@@ -537,7 +546,7 @@ def _leave_on_interrupt() -> None:
         while signal.SIGINT not in ours.recv(64):
             pass
         time.sleep(1.0)
-        typer.echo(f"\njaxid: interrupted{_farewell[0]()}", err=True)
+        _part()
         theirs.close()
         _leave()
 
