@@ -17,7 +17,7 @@ from jaxid.effects import Curve
 
 OUT = Path(__file__).parent / "img" / "effects"
 DEMO = Path(jaxid.__file__).parent / "demo" / "clean"
-COORDINATES = ("q", "v", "a", "tau", "t")
+COORDINATES = ("q", "v", "a", "tau")
 
 
 def main() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
         # The lighter joint shows most; some effects are on neither or on both.
         shown = next((v for v in forms if v.hypothesis.joint == 2), forms[0])
         path = OUT / f"{effect.__name__}.png"
-        draw(diagnosis, shown).write_image(path, width=700, height=200, scale=1)
+        draw(diagnosis, shown).write_image(path, width=760, height=210, scale=1)
         print(path.name, path.stat().st_size)
 
 
@@ -55,7 +55,7 @@ def telling(diagnosis: jaxid.Diagnosis, wave: np.ndarray, joint: int) -> tuple[C
     best, found, along = -1.0, Curve(joint=joint, coordinate="q", of=joint), y
     for kind in COORDINATES:
         values = np.asarray(getattr(motion, kind))
-        x = (values if kind == "t" else values[..., joint - 1])[mask]
+        x = values[..., joint - 1][mask]
         order = np.array_split(np.argsort(x, kind="stable"), 30)
         for signed in (False, True):
             z = y * sign if signed else y

@@ -486,11 +486,20 @@ def demo(
             _tell(story, quiet)
             if not quiet:
                 _error_falls(story)
+        if not quiet:
+            typer.echo(LEGEND)
         if report is not None:
             story.report(report)
         if not quiet:
             typer.echo("\nThe same as a page with figures: jaxid demo --report story.html")
             typer.echo("On your own recordings: jaxid discover --help")
+
+
+LEGEND = """
+relative error: norm of measured less simulated torque, over norm of measured torque
+fit, held out:  recordings that were fitted, and one that no fit has seen
+noise floor:    the error that a perfect model would leave
+±:              one standard deviation"""
 
 
 def _error_falls(story: Any) -> None:

@@ -180,6 +180,8 @@ def test_demo_tells_both_stories_on_files_that_are_shipped(monkeypatch):
     # Each error as a bar, the start's twice as long as what is left.
     bars = [line.count("█") for line in result.stdout.splitlines() if "█" in line]
     assert bars == [30, 15, 30, 15]
+    # What the words of the tables mean is said, once.
+    assert result.stdout.count("noise floor:") == 1
     brief = run("demo", "--quiet").stdout.splitlines()
     assert brief.count("adequate: a story") == 2
     assert not any("two lines" in line or "█" in line for line in brief)
