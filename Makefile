@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constr
 REQUIREMENTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types check clean
+.PHONY: help demo test lint types check docs clean
 
 help:
 	@echo "make demo    the story on bundled recordings"
@@ -14,6 +14,7 @@ help:
 	@echo "make lint    ruff"
 	@echo "make types   pyright"
 	@echo "make check   test, lint and types"
+	@echo "make docs    the documentation, in site/"
 	@echo "make clean   remove the virtual environment and caches"
 
 demo: .venv/.installed
@@ -30,6 +31,9 @@ types: .venv/.installed-dev
 
 check: test lint types
 
+docs: .venv/.installed-dev
+	$(BIN)/python -m mkdocs build --strict
+
 clean:
 	rm -rf .venv .pytest_cache .ruff_cache .hypothesis build dist
 	find jaxid tests -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -39,6 +43,7 @@ clean:
 	@touch $@
 
 .venv/.installed: .venv/.created $(REQUIREMENTS)
+	@echo "installing jaxid and what it stands on into .venv: a minute or two"
 	$(PIP) --editable .
 	@touch $@
 

@@ -2,16 +2,19 @@
 
 import contextlib
 import importlib.util
+import itertools
 import json
 import math
 import os
+import shutil
 import signal
 import socket
 import sys
+import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,12 +24,31 @@ from typer.core import TyperCommand
 
 from .errors import JaxidError, JaxidWarning, ModelError, RecordingError
 
+ABOUT = """Identify robot arms from closed-loop recordings, and find the effect the model lacks.
+
+\b
+Examples:
+  jaxid demo
+  jaxid fit run_1.csv run_2.csv --robot scara --json fit.json
+  jaxid compare held_out.csv --fit fit.json --plot compare.html
+  jaxid discover run_1.csv run_2.csv --validate held_out.csv --report story.html
+
+\b
+Exit codes:
+  0    it is done, whatever the verdict
+  1    a fit that found no parameters to trust; its result is printed and written all the same
+  2    something given cannot be used; the one line on stderr says what to do
+  130  interrupted by Ctrl-C
+
+Colours and progress are shown on a terminal only; NO_COLOR turns colours off.
+"""
+
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help="Identify robot arms from closed-loop recordings, and find the effect the model lacks.",
+    help=ABOUT,
 )
 
 # What shells give for a command that Ctrl-C ended.
@@ -48,6 +70,15 @@ _METHODS = "oem, pem, idim, idim-iv, didim, integral, filtered, fourier or diffe
 Controller = Annotated[
     str | None,
     typer.Option(help="tracking (the real law is unknown) or open-loop (recorded torque)."),
+]
+Window = Annotated[
+    float | None, typer.Option(help="Simulate pieces of this length on their own, s.")
+]
+Report = Annotated[
+    Path | None, typer.Option(help="Write the story to this HTML file, which needs no network.")
+]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="No progress, and the result in a line.")
 ]
 
 
@@ -154,12 +185,12 @@ def _say(text: str, **style: Any) -> None:
 
 
 @contextlib.contextmanager
-def _sentences(on_interrupt: str = "") -> Iterator[None]:
+def _sentences(on_interrupt: Callable[[], str] = str) -> Iterator[None]:
     """Ends on a user's error with its one sentence and on Ctrl-C with a message, no traceback.
 
     **Arguments:**
 
-    - `on_interrupt`: what else to say then.
+    - `on_interrupt`: saves what is to be saved then, and gives what else to say.
     """
     _farewell[0] = on_interrupt
     with warnings.catch_warnings():
@@ -170,7 +201,7 @@ def _sentences(on_interrupt: str = "") -> Iterator[None]:
             typer.echo(f"jaxid: {error}", err=True)
             raise typer.Exit(2) from None
         except KeyboardInterrupt:
-            typer.echo(f"\njaxid: interrupted{on_interrupt}", err=True)
+            _part()
             raise typer.Exit(INTERRUPTED) from None
 
 
@@ -189,20 +220,28 @@ def fit(
     unit: Unit = None,
     controller: Controller = None,
     method: Annotated[str, typer.Option(help=_METHODS)] = "oem",
-    window: Annotated[
-        float | None, typer.Option(help="Simulate pieces of this length on their own, s.")
-    ] = None,
+    window: Window = None,
+    quiet: Quiet = False,
 ) -> None:
     """Estimate the physical parameters of a robot from recordings.
 
-    Example: jaxid fit run_1.csv run_2.csv --robot scara --json fit.json
+    \b
+    Examples:
+      jaxid fit run_1.csv run_2.csv --robot scara --json fit.json
+      jaxid fit run.mat --robot emps --method idim
+      jaxid fit run.csv --robot my_robot.py:loop --column q=pos_a,pos_b --unit q=deg
+
+    The exit code is 0, 1 where no parameters were found that can be trusted, 2 where something
+    given cannot be used.
     """
     from . import estimate
 
     with _sentences():
+        _check_outputs(json_file)
+        oem = estimate.OEM(window=window, progress=not quiet)
         methods = {
-            "oem": lambda: estimate.OEM(window=window),
-            "pem": lambda: estimate.SeparablePEM(estimate.OEM(window=window)),
+            "oem": lambda: oem,
+            "pem": lambda: estimate.SeparablePEM(oem),
             "idim": estimate.IDIM,
             "idim-iv": estimate.IDIMIV,
             "didim": estimate.DIDIM,
@@ -215,7 +254,7 @@ def fit(
             raise ModelError(f"there is no method {method!r}: choose {', '.join(methods)}")
         loop = _with_controller(load_robot(robot), controller)
         found = estimate.fit(loop, _read(files, column, unit), methods[method]())
-        typer.echo(repr(found))
+        typer.echo(repr(found).partition("\n")[0] if quiet else repr(found))
         _write(json_file, found.to_dict())
         if not found.succeeded:
             raise typer.Exit(1)
@@ -233,25 +272,36 @@ def compare(
         Path | None, typer.Option("--fit", help="Values from a file that `jaxid fit --json` wrote.")
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="Write the figure to this HTML file.")] = None,
-    window: Annotated[
-        float | None, typer.Option(help="Simulate pieces of this length on their own, s.")
-    ] = None,
+    window: Window = None,
+    quiet: Quiet = False,
 ) -> None:
     """Hold a model against recordings: relative errors, and a figure.
 
-    Example: jaxid compare held_out.csv --fit fit.json --plot compare.html
+    \b
+    Examples:
+      jaxid compare held_out.csv --fit fit.json --plot compare.html
+      jaxid compare run.csv --robot my_robot.py:loop --json errors.json
+
+    The exit code is 0, or 2 where something given cannot be used.
     """
     from .discovery import compare as run_compare
 
     with _sentences():
+        _check_outputs(json_file, plot)
         loop = _with_controller(load_robot(robot), controller)
         if values is not None:
             loop = _with_fitted(loop, values)
         result = run_compare(loop, _read(files, column, unit), window=window)
-        typer.echo(repr(result))
+        errors = ", ".join(f"{name} {x:.3f} %" for name, x in _pooled(result).items())
+        typer.echo(f"{result.loop.name}: {errors}" if quiet else repr(result))
         _write(json_file, result.to_dict())
         if plot is not None:
             result.plot().write_html(plot, include_plotlyjs=True)
+
+
+def _pooled(result: Any) -> dict[str, float]:
+    """Relative error of each joint over all recordings together, %."""
+    return ((result.error_percent**2).mean() ** 0.5).to_dict()
 
 
 def _with_fitted(loop: Any, path: Path) -> Any:
@@ -316,20 +366,19 @@ def discover(
     ] = None,
     robot: Robot = "scara",
     json_file: Json = None,
-    report: Annotated[
-        Path | None, typer.Option(help="Write the story to this HTML file, which needs no network.")
-    ] = None,
+    report: Report = None,
     resume: Annotated[
         Path | None, typer.Option(help="Save each step in this folder, and go on from there.")
     ] = None,
     column: Column = None,
     unit: Unit = None,
     controller: Controller = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print the verdict alone.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Find the physical effect that the model lacks, and add it.
 
-    The exit code is 0 whatever the verdict, 2 where something given cannot be used.
+    The exit code is 0 whatever the verdict, 2 where something given cannot be used. Ctrl-C keeps
+    the steps so far in the folder of --resume, or else in jaxid-steps, and says how to go on.
 
     \b
     Examples:
@@ -339,8 +388,9 @@ def discover(
     """
     from .discovery import discover as run_discover
 
-    kept = "" if resume is None else f"; the same command goes on from the steps in {resume}"
-    with _sentences(kept):
+    journal = _Kept(resume)
+    # The folder outlives the interrupt, whose farewell takes the steps out of it.
+    with journal, _sentences(journal.farewell):
         _check_outputs(json_file, report)
         loop = _with_controller(load_robot(robot), controller)
         held_out = list(validate or [])
@@ -349,13 +399,49 @@ def discover(
             loop,
             _read(files, column, unit),
             validate=_read(held_out, column, unit) if held_out else None,
-            resume=resume,
+            resume=journal.path,
             progress=not quiet,
         )
         _tell(story, quiet)
         _write(json_file, story.to_dict())
         if report is not None:
             story.report(report)
+
+
+class _Kept:
+    """Where the steps of a discovery are saved: the user's folder, or one an interrupt keeps."""
+
+    def __init__(self, resume: Path | None) -> None:
+        self.own = Path(tempfile.mkdtemp(prefix="jaxid-")) if resume is None else None
+        self.path = resume or Path(str(self.own)) / "steps"
+
+    def __enter__(self) -> "_Kept":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.own is not None:
+            # What an interrupt wants kept has been moved out of here by its farewell.
+            shutil.rmtree(self.own, ignore_errors=True)
+
+    def farewell(self) -> str:
+        """What is said after an interrupt: what was done, and how to go on from there."""
+        done = len(list(self.path.glob("*.piece")))
+        if not done:
+            return " before the first step was done; nothing is saved"
+        path = self.path
+        if self.own is not None:
+            path = next(p for p in _names("jaxid-steps") if not p.exists())
+            shutil.move(self.path, path)
+        said = f" with {done} step{'s' if done > 1 else ''} done"
+        return f"{said}; the same command with --resume {path} goes on from there"
+
+
+def _names(name: str) -> Iterator[Path]:
+    """The name, then the same with a number."""
+    path = Path(name)
+    yield path
+    for k in itertools.count(2):
+        yield path.with_stem(f"{path.stem}-{k}")
 
 
 def _check_apart(files: list[Path], held_out: list[Path]) -> None:
@@ -376,15 +462,23 @@ def _tell(story: Any, quiet: bool = False) -> None:
 
 
 @app.command()
-def demo() -> None:
+def demo(
+    report: Report = None,
+    quiet: Quiet = False,
+) -> None:
     """The story on bundled recordings: a model that suffices, and one that lacks an effect.
 
-    Takes about a minute, most of it to compile.
+    Takes about a minute, most of it to compile. With --report, the second story as a page.
+
+    \b
+    Example:
+      jaxid demo --report story.html
     """
     from .discovery import discover as run_discover
     from .recording import read
 
     with _sentences():
+        _check_outputs(report)
         for kind, says in (
             ("clean", "1. Recordings of a SCARA that the model describes"),
             ("hidden", "2. The same arm with a physical effect that the model lacks"),
@@ -393,10 +487,24 @@ def demo() -> None:
                 used = read(path / "fit_1.csv", path / "fit_2.csv")
                 unseen = read(path / "held_out.csv")
             _say(f"\n{says}", bold=True)
-            story = run_discover(load_robot("scara"), used, validate=unseen)
-            _tell(story)
-            _error_falls(story)
-        typer.echo("\nOn your own recordings: jaxid discover --help")
+            story = run_discover(load_robot("scara"), used, validate=unseen, progress=not quiet)
+            _tell(story, quiet)
+            if not quiet:
+                _error_falls(story)
+        if not quiet:
+            typer.echo(LEGEND)
+        if report is not None:
+            story.report(report)
+        if not quiet:
+            typer.echo("\nThe same as a page with figures: jaxid demo --report story.html")
+            typer.echo("On your own recordings: jaxid discover --help")
+
+
+LEGEND = """
+relative error: norm of measured less simulated torque, over norm of measured torque
+fit, held out:  recordings that were fitted, and one that no fit has seen
+noise floor:    the error that a perfect model would leave
+±:              one standard deviation"""
 
 
 def _error_falls(story: Any) -> None:
@@ -427,8 +535,17 @@ def _keep_programs() -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
-# What an interrupt says beside that it was one; a command in progress sets it.
-_farewell = [""]
+# What an interrupt does and says beside that it was one; a command in progress sets it.
+_farewell: list[Callable[[], str] | None] = [str]
+_parting = threading.Lock()
+
+
+def _part() -> None:
+    """Says that it was an interrupt, once, whichever thread comes first; the other waits for it."""
+    with _parting:
+        farewell, _farewell[0] = _farewell[0], None
+        if farewell is not None:
+            typer.echo(f"\njaxid: interrupted{farewell()}", err=True)
 
 
 def _leave_on_interrupt() -> None:
@@ -445,7 +562,7 @@ def _leave_on_interrupt() -> None:
         while signal.SIGINT not in ours.recv(64):
             pass
         time.sleep(1.0)
-        typer.echo(f"\njaxid: interrupted{_farewell[0]}", err=True)
+        _part()
         theirs.close()
         _leave()
 

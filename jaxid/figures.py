@@ -28,6 +28,7 @@ MAX_LEGEND = 9
 INK = "#7b818b"
 GRID = "rgba(128,134,145,0.22)"
 SHADE = "rgba(128,134,145,0.20)"
+MISFIT = "rgba(216,69,90,0.20)"
 BLUE, ORANGE, GREEN, PURPLE, RED = "#2f86dd", "#dd7320", "#219b73", "#9a66d8", "#d8455a"
 PALETTE = (BLUE, ORANGE, GREEN, PURPLE, RED, "#96891c", "#c458a6", INK)
 DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
@@ -183,10 +184,38 @@ def comparison(
         figure.update_yaxes(title_text="autocorrelation", range=[-reach, reach], row=row, col=2)
         drawn += upper + lower
     _shade_gaps(figure, time, drawn)
-    figure.update_xaxes(matches="x", showticklabels=False, col=1)
+    for row in range(1, 2 * joints + 1):
+        # An axis that matches itself is what plotly warns of in a browser's console.
+        figure.update_xaxes(matches="x" if row > 1 else None, showticklabels=False, row=row, col=1)
     figure.update_xaxes(title_text="time (s)", showticklabels=True, row=2 * joints, col=1)
-    figure.update_xaxes(title_text="lag (samples)", row=2 * joints - 1, col=2)
+    figure.update_xaxes(showticklabels=False, col=2)
+    last: dict[str, Any] = {"row": 2 * joints - 1, "col": 2}
+    figure.update_xaxes(title_text="lag (samples)", showticklabels=True, **last)
     return _finish(figure, title, height=140 + 290 * joints, legend=True)
+
+
+def mark_misfit(
+    figure: go.Figure, joint: int, spans: Sequence[tuple[float, float]], name: str = "misfit"
+) -> go.Figure:
+    """Shade stretches of one joint in a comparison; the longest 40 are drawn.
+
+    Arguments:
+        figure: What `comparison` gave; it is changed.
+        joint: Counted from 1.
+        spans: Start and end of each stretch, s.
+        name: What the legend calls them.
+    """
+    longest = sorted(spans, key=lambda span: span[0] - span[1])[:MAX_GAPS]
+    for row in (2 * joint - 1, 2 * joint):
+        cell: dict[str, Any] = {"row": row, "col": 1}
+        for start, end in longest:
+            edges = {"x0": float(start), "x1": float(end), "line": {"width": 0}}
+            figure.add_vrect(fillcolor=MISFIT, layer="below", **edges, **cell)
+    present: Any = figure.data
+    if longest and all(trace.name != name for trace in present):
+        square = {"symbol": "square", "size": 12, "color": MISFIT}
+        figure.add_scatter(x=[None], y=[None], name=name, mode="markers", marker=square)
+    return figure
 
 
 def error_bars(
@@ -308,6 +337,7 @@ def curve_fit(
     band: Float[np.ndarray, " points"] | None = None,
     *,
     y_name: str = "residual",
+    curve_name: str = "fitted curve",
     title: str | None = None,
 ) -> go.Figure:
     """Draw a residual against a coordinate, with a fitted curve and its confidence band.
@@ -322,6 +352,7 @@ def curve_fit(
         curve: Fitted curve in `y_unit`, shape `(points,)`.
         band: Half-width of the confidence band in `y_unit`, shape `(points,)`.
         y_name: What is drawn upwards.
+        curve_name: What the legend calls the curve.
         title: Of the whole figure.
     """
     figure = go.Figure()
@@ -333,10 +364,44 @@ def curve_fit(
     if band is not None:
         figure.add_trace(_band_trace("confidence band", curve_x, curve - band, curve + band))
     line = {"color": BLUE, "width": 2.6}
-    figure.add_scatter(x=curve_x, y=curve, name="fitted curve", mode="lines", line=line)
+    figure.add_scatter(x=curve_x, y=curve, name=curve_name, mode="lines", line=line)
     figure.update_xaxes(title_text=_with_unit(x_name, x_unit))
     figure.update_yaxes(title_text=_with_unit(y_name, y_unit))
     return _finish(figure, title, height=400, legend=True)
+
+
+def dependence(
+    x: Float[np.ndarray, " samples"],
+    y: Float[np.ndarray, " samples"],
+    x_name: str,
+    x_unit: str,
+    y_unit: str,
+    *,
+    y_name: str = "residual",
+    title: str | None = None,
+) -> go.Figure:
+    """Draw a residual against a coordinate, with its mean in stretches of equal count.
+
+    The band is two standard errors either side, as of independent samples.
+
+    Arguments:
+        x: Coordinate in `x_unit`, shape `(samples,)`.
+        y: Residual in `y_unit`, shape `(samples,)`.
+        x_name: What the coordinate is, such as "velocity of joint 2".
+        x_unit: Unit, as printed.
+        y_unit: Unit, as printed.
+        y_name: What is drawn upwards.
+        title: Of the whole figure.
+    """
+    order = np.array_split(np.argsort(x, kind="stable"), max(2, min(30, len(x) // 20)))
+    middle = np.array([np.median(x[k]) for k in order])
+    mean = np.array([np.mean(y[k]) for k in order])
+    error = np.array([2 * np.std(y[k]) / np.sqrt(len(k)) for k in order])
+    # A coordinate that stands still gives several stretches one place, which a line cannot have.
+    distinct = np.append(True, np.diff(middle) > 0)
+    line = middle[distinct], mean[distinct], error[distinct]
+    names = {"y_name": y_name, "curve_name": "mean", "title": title}
+    return curve_fit(x, y, x_name, x_unit, y_unit, *line, **names)
 
 
 def parameters(

@@ -1,6 +1,7 @@
 """The closed loop: arm, effects, controller and sensors, and its equations of motion."""
 
 import dataclasses
+import html
 import math
 from collections.abc import Iterable
 
@@ -169,6 +170,19 @@ class ClosedLoop(eqx.Module):
             )
         return dataclasses.replace(self, effects=kept)
 
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            "<tr>"
+            + "".join(f"<td>{html.escape(cell)}</td>" for cell in _row(self, p))
+            + "</tr>"
+            for p in self.parameters
+        )
+        head = "".join(f"<th>{name}</th>" for name in ("parameter", "value", "unit", "bounds", ""))
+        return (
+            f"<p>{html.escape(repr(self).split(';')[0])}; {type(self.controller).__name__})</p>"
+            f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+        )
+
     def __repr__(self) -> str:
         effects = ", ".join(
             effect.effect_name() + (f"({effect.joint})" if hasattr(effect, "joint") else "")  # type: ignore[attr-defined]
@@ -181,6 +195,15 @@ class ClosedLoop(eqx.Module):
             f"ClosedLoop({self.name}: {type(self.arm).__name__} with {effects}; "
             f"{type(self.controller).__name__}; {values})"
         )
+
+
+def _row(loop: ClosedLoop, p: Parameter) -> tuple[str, ...]:
+    """A parameter's line in the loop's table: name, value, unit, bounds, whether fits leave it."""
+    low, high = p.declaration.lower, p.declaration.upper
+    bounds = [f"≥ {low:g}" if low > -math.inf else "", f"≤ {high:g}" if high < math.inf else ""]
+    value = "several" if p.several else f"{float(p.where(loop)):.4g}"
+    free = any(p.name == other.name for other in loop.free_parameters)
+    return p.name, value, loop.unit(p), " ".join(filter(None, bounds)), "" if free else "held"
 
 
 def rest(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> State:

@@ -168,7 +168,7 @@ def test_demo_tells_both_stories_on_files_that_are_shipped(monkeypatch):
 
     asked = []
 
-    def discover(loop, used, validate):
+    def discover(loop, used, validate, progress):
         asked.append((loop.name, used.names, validate.names, used[0].q[:3].tolist()))
         return Story()
 
@@ -180,3 +180,34 @@ def test_demo_tells_both_stories_on_files_that_are_shipped(monkeypatch):
     # Each error as a bar, the start's twice as long as what is left.
     bars = [line.count("█") for line in result.stdout.splitlines() if "█" in line]
     assert bars == [30, 15, 30, 15]
+    # What the words of the tables mean is said, once.
+    assert result.stdout.count("noise floor:") == 1
+    brief = run("demo", "--quiet").stdout.splitlines()
+    assert brief.count("adequate: a story") == 2
+    assert not any("two lines" in line or "█" in line for line in brief)
+
+
+def test_quiet_is_one_line(fitted):
+    _, path = fitted
+    result = run("compare", HELD_OUT, "--fit", path, "--quiet")
+    assert result.exit_code == 0
+    assert len(result.stdout.splitlines()) == 1
+    assert result.stdout.startswith("scara: joint 1 1.5")
+    brief = run("fit", FIT_1, "--method", "idim", "-q").stdout.splitlines()
+    assert len(brief) == 1
+    assert brief[0].startswith("IDIM(")
+
+
+@pytest.mark.parametrize("command", [[], ["fit"], ["compare"], ["discover"], ["demo"]])
+def test_help_has_examples_and_exit_codes(command):
+    said = run(*command, "--help").stdout
+    assert f"jaxid {' '.join(command)}".strip() in said
+    assert "Example" in said
+    assert "xit code" in said or command == ["demo"]
+    # Nothing was run together: an example is a line of its own.
+    assert any(line.strip().startswith("jaxid ") for line in said.splitlines())
+
+
+def test_colours_are_for_terminals_that_want_them(fitted):
+    result, _ = fitted
+    assert "\x1b" not in result.stdout + result.stderr

@@ -165,16 +165,39 @@ def test_without_recordings_it_says_what_is_missing() -> None:
     assert "Missing argument" in result.stderr
 
 
-def test_an_interrupt_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def interrupted(*args, **settings):
+def _interrupted(monkeypatch: pytest.MonkeyPatch, after: int, *options: str) -> Any:
+    """The command's end, interrupted when so many steps are saved."""
+
+    def stop(*args, resume, **settings):
+        if after:
+            resume.mkdir()
+        for k in range(after):
+            (resume / f"turn_{k}.piece").write_text("kept", encoding="utf-8")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(jaxid.discovery, "discover", interrupted)
-    steps = tmp_path / "steps"
-    result = CliRunner().invoke(app, ["discover", HIDDEN[0], "--resume", str(steps)])
+    monkeypatch.setattr(jaxid.discovery, "discover", stop)
+    result = CliRunner().invoke(app, ["discover", HIDDEN[0], *options])
     assert result.exit_code == 130
-    assert f"goes on from the steps in {steps}" in result.stderr
     assert "Traceback" not in result.stderr
+    return result
+
+
+def test_an_interrupt_keeps_the_steps_and_says_how_to_go_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    steps = tmp_path / "steps"
+    said = _interrupted(monkeypatch, 2, "--resume", str(steps)).stderr
+    assert "interrupted with 2 steps done" in said
+    assert f"--resume {steps} goes on from there" in said
+    # Without --resume the steps are kept too, beside what is there already.
+    for name in ("jaxid-steps", "jaxid-steps-2"):
+        said = _interrupted(monkeypatch, 1).stderr
+        assert f"--resume {name} goes on from there" in said
+        assert [kept.read_text() for kept in (tmp_path / name).iterdir()] == ["kept"]
+    assert "nothing is saved" in _interrupted(monkeypatch, 0).stderr
+    left = sorted(p.name for p in tmp_path.iterdir())
+    assert left == ["jaxid-steps", "jaxid-steps-2", "steps"]
 
 
 def test_help_shows_examples() -> None:

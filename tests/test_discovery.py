@@ -131,7 +131,7 @@ def test_results_show_themselves(bump_story):
         bump_story.plot(),
     ):
         assert any(axis.title.text for axis in figure.select_xaxes())
-    assert "q2" in bump_story._repr_html_()
+    assert "position of joint 2" in bump_story._repr_html_()
 
 
 @pytest.fixture(scope="session")

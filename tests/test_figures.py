@@ -55,6 +55,10 @@ def _curve_fit() -> go.Figure:
     return figures.curve_fit(WAVE, WAVE**2, "velocity", "rad/s", "N·m", x, x**2, band)
 
 
+def _dependence() -> go.Figure:
+    return figures.dependence(WAVE, WAVE**2, "velocity", "rad/s", "N·m")
+
+
 def _parameters() -> go.Figure:
     values, stds = np.array([3.4, 0.0]), np.array([0.02, 0.1])
     return figures.parameters(["ZZ1r", "MY2"], values, stds, ["kg·m²", "kg·m"], values + 0.01)
@@ -86,6 +90,7 @@ DRAWINGS = {
     ),
     "autocorrelation": (_autocorrelation, ["autocorrelation"]),
     "curve_fit": (_curve_fit, ["residual", "confidence band", "fitted curve"]),
+    "dependence": (_dependence, ["residual", "confidence band", "mean"]),
     "parameters": (_parameters, ["estimate ± 2σ", "reference"]),
     "ranking": (_ranking, ["significant", "not significant"]),
     "shares": (_shares, ["residual", "explained", "stribeck", "spring", "rest"]),
@@ -190,6 +195,26 @@ def test_gaps_break_the_line_and_are_shaded():
     spans = [(0.99, 1.51), (time[missing[0] - 1], time[missing[-1] + 1])]
     np.testing.assert_allclose(edges, spans, atol=1e-12)
     assert figure.data[-1].name == "no data"
+
+
+def test_misfit_is_shaded_beside_its_joint_and_named_once():
+    figure = figures.mark_misfit(_comparison(), 2, [(0.5, 1.0), (2.0, 2.2)])
+    figures.mark_misfit(figure, 1, [(1.0, 1.1)])
+    spans = [(s.xref, s.x0, s.x1) for s in figure.layout.shapes if s.x1 - s.x0 < 1]
+    # Panels 1 and 2 are joint 1's, 3 and 4 joint 2's; the third axis is that of autocorrelation.
+    rows = {axis: sum(span[0] == axis for span in spans) for axis in {s[0] for s in spans}}
+    assert sorted(rows.values()) == [1, 1, 2, 2]
+    assert [trace.name for trace in figure.data].count("misfit") == 1
+
+
+def test_a_mean_follows_what_depends():
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1, 1, 3000)
+    figure = figures.dependence(x, x**2 + 0.1 * rng.standard_normal(3000), "q", "rad", "N·m")
+    line = figure.data[-1]
+    np.testing.assert_allclose(line.y, line.x**2, atol=0.05)
+    still = figures.dependence(np.zeros(300), rng.standard_normal(300), "q", "rad", "N·m")
+    assert len(still.data[-1].x) == 1
 
 
 def test_nothing_is_shaded_without_gaps():

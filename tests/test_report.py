@@ -51,8 +51,13 @@ def page() -> Page:
 
 @pytest.mark.slow
 def test_it_loads_nothing(page: Page) -> None:
-    loading = ("src", "href", "srcset", "data", "poster", "action", "background")
+    loading = ("src", "srcset", "data", "poster", "action", "background")
     assert [e for e in page.elements if any(name in e[1] for name in loading)] == []
+    # Links lead to places on the page, each of which is there once.
+    places = [a["id"] for _, a in page.elements if "id" in a]
+    links = [a["href"] for _, a in page.elements if "href" in a]
+    assert len(links) > 5
+    assert sorted(links) == sorted(f"#{place}" for place in places)
     assert "link" not in {name for name, _ in page.elements}
     styles = [code for code in page.code if "{" in code and "function" not in code]
     assert not any(re.search(r"@import|url\(", style) for style in styles)
@@ -76,6 +81,7 @@ def test_the_verdict_comes_first(page: Page) -> None:
         "Why this effect and not its rivals",
         "Parameters",
         "What is left",
+        "What to record next",
         "To do it again",
     ):
         assert heading in text

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
@@ -24,10 +23,11 @@ from ..loop import ClosedLoop
 from ..noise import autocorrelation
 from ..recording import Recording, Recordings
 from ..saved import save
+from ..showing import AbstractShown
 from ..simulate import Simulated, band_of, compared, simulate
 
 
-class Comparison(eqx.Module):
+class Comparison(AbstractShown):
     """Measured beside simulated signals.
 
     - `runs`: the simulated signals, one for each recording.

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -26,6 +25,7 @@ from ..parameters import write_values
 from ..progress import working
 from ..recording import Recordings
 from ..saved import save
+from ..showing import AbstractShown
 from ..simulate import Batch, prepare, with_substeps
 from .compare import Comparison
 from .linear import Linearised, base_columns, linearise
@@ -60,7 +60,7 @@ class Verdict(eqx.Module):
         return self.hypothesis.name, self.hypothesis.joint
 
 
-class Diagnosis(eqx.Module):
+class Diagnosis(AbstractShown):
     """Where a fitted model fails and which effects may be missing, ranked.
 
     - `ranking`: the catalogue's entries, each at its best setting, best first.
@@ -153,10 +153,15 @@ class Diagnosis(eqx.Module):
         total = self.gram.rest
         for verdict in self.ranking:
             values, stds = self.amplitude(verdict)
-            symbols = [n for p in amplitudes(verdict.hypothesis.effect) for n in p.names]
-            symbols = symbols or ["setting"]
+            shown = [
+                (name, self.fit.loop.unit(p))
+                for p in amplitudes(verdict.hypothesis.effect)
+                for name in p.names
+            ]
+            rows_of = zip(shown or [("setting", "1")], values, stds, strict=True)
             size = ", ".join(
-                f"{s} {v:.3g} ± {d:.1g}" for s, v, d in zip(symbols, values, stds, strict=True)
+                f"{s} {v:.3g} ± {d:.1g}{'' if unit == '1' else f' {unit}'}"
+                for (s, unit), v, d in rows_of
             )
             error = self.predicted_error(verdict) if verdict.p_value < 0.05 else None
             rows.append(
@@ -223,45 +228,31 @@ class Diagnosis(eqx.Module):
         unit = self.fit.loop.arm.units()[0][joint - 1]
         return figures.shares_in_time(time, residual, shares, unit=unit)
 
-    def plot_where(self, place: int = 0, recording: int = 0) -> go.Figure:
-        """The residual against a coordinate on which it depends, with the fitted curve.
+    def plot_where(self, place: int = 0) -> go.Figure:
+        """The residual of all recordings against a coordinate on which it depends, and its mean.
+
+        Where it depends on the direction of motion as well, it is drawn times the sign of velocity.
 
         **Arguments:**
 
-        - `place`: in `where`, 0 for the strongest. `recording`: number from 0.
+        - `place`: in `where`, 0 for the strongest.
         """
-        verdict = self.where[place]
-        curve = self.predicted(verdict)
+        curve = self.where[place].hypothesis.effect
         assert isinstance(curve, Curve)
-        motion = self.motion
-        x = np.asarray(motion.t if curve.coordinate == "t" else getattr(motion, curve.coordinate))
-        x = x[recording] if curve.coordinate == "t" else x[recording, :, curve.of - 1]
-        residual = self.data.residual[recording, :, (curve.joint or 1) - 1]
-        if len(x) != len(residual):
-            x = np.interp(np.linspace(0, 1, len(residual)), np.linspace(0, 1, len(x)), x)
-        keep = self.data.mask[recording]
-        grid = np.linspace(float(curve.low), float(curve.high), 200)
-        basis = np.asarray(jax.vmap(curve.basis)(jnp.asarray(grid)))
-        values, covariance = self.gram.amplitude(verdict.hypothesis.columns)
-        band = 2 * np.sqrt(np.maximum(np.einsum("gk,kl,gl->g", basis, covariance, basis), 0))
+        joint, motion = curve.joint, self.motion
+        along = motion.t if curve.coordinate == "t" else getattr(motion, curve.coordinate)
+        along = np.asarray(along if curve.coordinate == "t" else along[..., curve.of - 1])
+        x, y = self._kept(along), self._kept(self.data.residual[..., joint - 1])
+        if curve.signed:
+            y = y * np.sign(self._kept(np.asarray(motion.v)[..., joint - 1]))
         torque, position = self.fit.loop.arm.units()
-        unit = {
-            "q": position[curve.of - 1],
-            "v": f"{position[curve.of - 1]}/s",
-            "a": f"{position[curve.of - 1]}/s²",
-            "tau": torque[curve.of - 1],
-            "t": "s",
-        }[curve.coordinate]
-        return figures.curve_fit(
-            x[keep],
-            residual[keep],
-            curve.label,
-            unit,
-            torque[curve.joint - 1],
-            grid,
-            basis @ values,
-            band,
-            y_name=f"residual of joint {curve.joint}",
+        return figures.dependence(
+            x,
+            y,
+            curve.spoken_coordinate,
+            coordinate_unit(curve, torque, position),
+            torque[joint - 1],
+            y_name=f"residual of joint {joint}" + (" × sign of velocity" if curve.signed else ""),
         )
 
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -274,6 +265,14 @@ class Diagnosis(eqx.Module):
         **Raises:** `SaveError` where it cannot be written.
         """
         return save(self, path)
+    def _kept(self, rows: Float[np.ndarray, "recordings points"]) -> Float[np.ndarray, " samples"]:
+        """The samples of all recordings, one after the other, of rows that may be finer."""
+        mask = self.data.mask
+        ends = np.linspace(0, 1, mask.shape[1])
+        if rows.shape[1] != mask.shape[1]:
+            own = np.linspace(0, 1, rows.shape[1])
+            rows = np.stack([np.interp(ends, own, row) for row in rows])
+        return rows[mask]
 
     def to_dict(self) -> dict[str, Any]:
         """The ranking and where the model fails, as plain JSON."""
@@ -331,6 +330,15 @@ class Diagnosis(eqx.Module):
 def _label(verdict: Verdict) -> str:
     joint = verdict.hypothesis.joint
     return verdict.hypothesis.name + ("" if joint is None else f", joint {joint}")
+
+
+def coordinate_unit(curve: Curve, torque: Sequence[str], position: Sequence[str]) -> str:
+    """The unit of a curve's coordinate, given those of each joint's torque and position."""
+    if curve.coordinate == "t":
+        return "s"
+    if curve.coordinate == "tau":
+        return torque[curve.of - 1]
+    return position[curve.of - 1] + {"v": "/s", "a": "/s²"}.get(curve.coordinate, "")
 
 
 def total_percent(fit: Fit | Comparison) -> Float[np.ndarray, " joints"]:

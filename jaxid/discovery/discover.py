@@ -4,6 +4,7 @@ import dataclasses
 import html
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -29,6 +30,7 @@ from ..parameters import Bounds, list_parameters, read_values, write_values
 from ..progress import working
 from ..recording import Recording, Recordings
 from ..saved import save
+from ..showing import AbstractShown
 from ..simulate import compared
 from .compare import Comparison, compare
 from .diagnose import Diagnosis, Verdict, diagnose, effect_parameters
@@ -63,7 +65,7 @@ class Step(eqx.Module):
     contenders: tuple[Contender, ...] = ()
 
 
-class Discovery(eqx.Module):
+class Discovery(AbstractShown):
     """The story: what the model lacked, step by step, and where it stopped.
 
     - `verdict`: `"adequate"`, `"explained"` or `"outside_catalogue"`.
@@ -95,7 +97,7 @@ class Discovery(eqx.Module):
     @property
     def sentence(self) -> str:
         """The verdict in a sentence for a colleague."""
-        added = [_called(step) for step in self.steps if step.added is not None]
+        added = _spoken(self.steps)
         if self.verdict == "adequate":
             return (
                 f"The model of {self.loop.name} describes these recordings down to their noise: "
@@ -103,12 +105,18 @@ class Discovery(eqx.Module):
             )
         if self.verdict == "explained":
             return f"The model lacked {' and '.join(added)}; with that, nothing is left to explain."
-        where = self.diagnosis.depends_on()
-        first = where[0] if where else {"coordinate": "?", "joint": "?"}
         after = f" after adding {' and '.join(added)}" if added else ""
+        left = f"Something is left{after} that no effect of the catalogue explains"
+        if not self.diagnosis.depends_on():
+            return f"{left}."
+        hypothesis = self.diagnosis.where[0].hypothesis
+        curve = hypothesis.effect
+        assert isinstance(curve, Curve)
+        on = "time" if curve.coordinate == "t" else f"the {curve.spoken_coordinate}"
+        how = " and on the direction of motion" if curve.signed else ""
         return (
-            f"Something is left{after} that no effect of the catalogue explains: the torque of "
-            f"joint {first['joint']} depends on {first['coordinate']} in a way the model lacks."
+            f"{left}: the torque of joint {hypothesis.joint} depends on {on}{how} in a way the "
+            "model lacks."
         )
 
     def table(self) -> pd.DataFrame:
@@ -221,12 +229,27 @@ class Discovery(eqx.Module):
         return "\n".join([*lines, *self.notes])
 
     def _repr_html_(self) -> str:
-        body = html.escape(repr(self).split("\n", 1)[1])
-        return f"<p><b>{html.escape(self.sentence)}</b></p><pre>{body}</pre>"
+        errors = self.table().rename(columns=lambda name: f"{name}, %")
+        floor = ", ".join(f"{x:.3f} %" for x in self.noise_floor_percent())
+        found = repr(self).split("noise floor, %:")[1].split("\n")[1:]
+        lines = "".join(f"<li>{html.escape(line)}</li>" for line in found)
+        return (
+            f"<p><b>{html.escape(self.sentence)}</b></p><p>relative error by step</p>"
+            f"{errors.to_html(float_format='%.3f')}<p>noise floor by joint: {floor}</p>"
+            f"<ul>{lines}</ul>"
+        )
 
 
 def _name(name: str, joint: int | None) -> str:
     return name + ("" if joint is None else f" on joint {joint}")
+
+
+def _spoken(steps: Sequence[Step]) -> list[str]:
+    """Added effects in words; what was added twice is said once."""
+    effects = [step.added for step in steps if step.added is not None]
+    counted = Counter(_name(e.spoken(), getattr(e, "joint", None)) for e in effects)
+    often = {1: "", 2: " twice"}
+    return [name + often.get(n, f" {n} times") for name, n in counted.items()]
 
 
 def _called(step: Step) -> str:
@@ -452,12 +475,12 @@ class _Search(eqx.Module):
         )
 
     def refit(
-        self, last: Step, leading: Sequence[Verdict], say: Callable[[str], None]
+        self, last: Step, leading: Sequence[Verdict], say: Callable[..., None]
     ) -> list[Contender]:
         """The leading entries as full nonlinear models, best first."""
         found = []
-        for verdict in leading:
-            say(f"refit with {_name(*verdict.key)}")
+        for k, verdict in enumerate(leading):
+            say(f"refit with {_name(*verdict.key)}, {k + 1} of {len(leading)}", k / len(leading))
             # What was screened at a finite setting may start in another valley at its prediction.
             starts = [last.diagnosis.predicted(verdict)]
             if not amplitudes(verdict.hypothesis.effect):

@@ -1,9 +1,11 @@
 """What to record next, so that effects which look alike can be told apart."""
 
+import html
 from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
+import pandas as pd
 import plotly.graph_objects as go
 from jaxtyping import Float
 
@@ -13,6 +15,7 @@ from ..errors import FitError
 from ..excitation import Limits
 from ..loop import ClosedLoop
 from ..recording import Recording
+from ..showing import AbstractShown
 from ..simulate import prepare, with_substeps
 from .diagnose import Diagnosis, Verdict, _at_samples
 from .linear import base_columns, linearise
@@ -20,7 +23,7 @@ from .score import Data, Gram
 from .signatures import signatures
 
 
-class Experiment(eqx.Module):
+class Experiment(AbstractShown):
     """A reference to record next.
 
     - `recording`: its `time` and `q_ref`; `q` and `tau` are what the model expects.
@@ -42,6 +45,22 @@ class Experiment(eqx.Module):
             for j, column in enumerate(r.q_ref.T, start=1)
         ]
         return figures.signals(r.time, panels)
+
+    def _repr_html_(self) -> str:
+        r = self.recording
+        assert r.q_ref is not None
+        speed = np.abs(np.gradient(r.q_ref, r.time, axis=0))
+        rows = [
+            {
+                "from, rad": r.q_ref[:, j].min(),
+                "to, rad": r.q_ref[:, j].max(),
+                "speed up to, rad/s": speed[:, j].max(),
+                "torque up to, N·m": np.abs(r.tau[:, j]).max(),
+            }
+            for j in range(r.joints)
+        ]
+        table = pd.DataFrame(rows, index=[f"joint {j}" for j in range(1, r.joints + 1)])
+        return f"<p>{html.escape(repr(self))}</p>{table.to_html(float_format='%.3g')}"
 
     def __repr__(self) -> str:
         return (

@@ -55,6 +55,11 @@ class AbstractEffect(eqx.Module):
         return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
 
     @classmethod
+    def spoken(cls) -> str:
+        """Its name in a sentence: that in tables, in words."""
+        return cls.effect_name().replace("_", " ")
+
+    @classmethod
     def screened(cls, scene: Scene) -> Iterable["AbstractEffect"]:
         """Instances to screen, at zero amplitude: every joint, and a grid of shapes if it has any.
 

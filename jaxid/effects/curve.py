@@ -39,6 +39,12 @@ class Curve(AbstractEffect):
         """The coordinate with its joint, as `v2`; time alone."""
         return "t" if self.coordinate == "t" else f"{self.coordinate}{self.of}"
 
+    @property
+    def spoken_coordinate(self) -> str:
+        """The coordinate in words, as `velocity of joint 2`."""
+        words = {"q": "position", "v": "velocity", "a": "acceleration", "tau": "drive torque"}
+        return "time" if self.coordinate == "t" else f"{words[self.coordinate]} of joint {self.of}"
+
     def basis(self, x: Float[Array, ""]) -> Float[Array, " knots"]:
         """The value of each B-spline at a coordinate, `(knots,)`; they sum to one."""
         n = self.coefficients.shape[0]

@@ -55,6 +55,11 @@ class Stribeck(AbstractEffect):
     gamma: Scalar = sharpness()
 
     @classmethod
+    def spoken(cls) -> str:
+        """Stribeck friction, after whom it is called."""
+        return "Stribeck friction"
+
+    @classmethod
     def screened(cls, scene: Scene) -> Iterable["Stribeck"]:
         """Velocities from a fiftieth to a half of the highest speed."""
         shares = np.geomspace(0.02, 0.5, 7)

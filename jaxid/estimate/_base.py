@@ -19,6 +19,7 @@ from ..loop import ClosedLoop
 from ..noise import ARFilter, VectorAR, innovations, ljung_box
 from ..recording import Recording, Recordings
 from ..saved import save
+from ..showing import AbstractShown
 
 
 class Status(enum.Enum):
@@ -32,7 +33,7 @@ class Status(enum.Enum):
     overflowed = "its numbers leave what float64 holds; check the units of the recordings"
 
 
-class Fit(eqx.Module):
+class Fit(AbstractShown):
     """What an estimate gave: a loop with its parameters, how sure they are, and how it went.
 
     - `loop`: the model with the estimated values.

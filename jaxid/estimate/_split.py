@@ -21,8 +21,8 @@ from ._base import AbstractMethod, Fit, determined_covariance
 from ._encoder import Kernels, errors_of, row_errors, solve_weighted
 from ._operators import Operator
 from ._regression import effect_states, linear_parameters, regression
-from .idim import Solved, Stacked, regression_fit, solve
 from .deviations import score_covariance
+from .idim import Solved, Stacked, regression_fit, solve
 from .states import AbstractStates
 
 EncoderWeights = Literal["joint", "encoder"]

@@ -14,12 +14,12 @@ class Markup(str):
 Content = str | int | float | None
 
 
-def tag(name: str, *content: Content, **attributes: str | None) -> Markup:
+def tag(name: str, *content: Content, **attributes: Content) -> Markup:
     """An element; a trailing underscore in an attribute's name is dropped (`class_`)."""
     words = [name]
     for key, value in attributes.items():
         if value is not None:
-            words.append(f'{key.rstrip("_").replace("_", "-")}="{html.escape(value)}"')
+            words.append(f'{key.rstrip("_").replace("_", "-")}="{html.escape(str(value))}"')
     return Markup(f"<{' '.join(words)}>{join(*content)}</{name}>")
 
 
@@ -65,18 +65,38 @@ def probability(p: float) -> str:
     return "< 1e−300" if p < 1e-300 else number(float(f"{p:.2g}"))
 
 
-def figure(drawn: go.Figure, caption: Content, wide: bool = False) -> Markup:
-    """A figure with its caption; a wide one scrolls on a narrow page."""
-    body = drawn.to_html(
-        full_html=False,
-        include_plotlyjs=False,
-        include_mathjax=False,
-        # More buttons than these lie over the legend on a narrow page.
-        config={
-            "responsive": True,
-            "displaylogo": False,
-            "modeBarButtons": [["toImage", "resetScale2d"]],
-        },
+def details(summary: Content, *content: Content, class_: str | None = None) -> Markup:
+    """What only some readers want, folded away; printed nevertheless, unless it is `raw`."""
+    return tag("details", tag("summary", summary), *content, class_=class_)
+
+
+def link(text: Content, anchor: str) -> Markup:
+    """A link to a place on the page."""
+    return tag("a", text, href=f"#{anchor}")
+
+
+def figure(
+    drawn: go.Figure, caption: Content, wide: bool = False, linked: str | None = None
+) -> Markup:
+    """A figure with its caption, drawn by the page's script once it comes into sight.
+
+    **Arguments:**
+
+    - `wide`: scrolls on a narrow page.
+    - `linked`: figures of the same word share their zoom in time.
+    """
+    height = int(drawn.layout.height or 400)
+    box = tag(
+        "div",
+        class_="wide" if wide else "plot",
+        style=f"height:{height}px",
+        data_figure="",
+        data_linked=linked,
+        tabindex="0" if linked else None,
+        role="group" if linked else "img",
+        aria_label=f"{caption} Plus and minus zoom, arrows move, 0 resets." if linked else caption,
     )
-    box = tag("div", Markup(body), class_="wide" if wide else "plot")
-    return tag("figure", tag("div", box, class_="scroll"), tag("figcaption", caption))
+    # Nothing that a figure holds can end the script early.
+    data = Markup((drawn.to_json() or "").replace("<", "\\u003c"))
+    script = tag("script", data, type="application/json")
+    return tag("figure", tag("div", box, script, class_="scroll"), tag("figcaption", caption))

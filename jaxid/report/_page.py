@@ -47,9 +47,11 @@ def page(story: Discovery) -> str:
         *meta,
         tag("title", f"{story.loop.name}: {story.sentence}"),
         tag("style", Markup(_part("page.css"))),
-        tag("script", Markup(get_plotlyjs())),
     )
-    content = tag("body", tag("main", body(story)), tag("script", Markup(_part("page.js"))))
+    without = tag("noscript", tag("p", "The figures need JavaScript.", class_="note"))
+    # Last, so that the verdict is read while the browser still takes in the drawing library.
+    scripts = [tag("script", Markup(code)) for code in (get_plotlyjs(), _part("page.js"))]
+    content = tag("body", tag("main", without, body(story)), *scripts)
     return f"<!doctype html>\n{tag('html', join(head, content), lang='en')}\n"
 
 

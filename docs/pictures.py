@@ -1,0 +1,102 @@
+"""Pictures of what each effect of the catalogue leaves of a fit that lacks it: docs/img/effects.
+
+python docs/pictures.py    needs the extra `static`; about a minute
+"""
+
+from pathlib import Path
+
+import numpy as np
+import plotly.graph_objects as go
+from jaxtyping import Float
+from plotly.subplots import make_subplots
+
+import jaxid
+from jaxid import figures
+from jaxid.discovery.diagnose import Verdict, coordinate_unit
+from jaxid.effects import Curve
+
+OUT = Path(__file__).parent / "img" / "effects"
+DEMO = Path(jaxid.__file__).parent / "demo" / "clean"
+COORDINATES = ("q", "v", "a", "tau")
+
+
+def main() -> None:
+    """Writes one picture for each class of the catalogue."""
+    recordings = jaxid.read(DEMO / "fit_1.csv", DEMO / "fit_2.csv")
+    diagnosis = jaxid.diagnose(jaxid.fit(jaxid.scara(), recordings), progress=False)
+    OUT.mkdir(parents=True, exist_ok=True)
+    for effect in jaxid.catalogue:
+        forms = [v for v in diagnosis.forms if type(v.hypothesis.effect) is effect]
+        # The lighter joint shows most; some effects are on neither or on both.
+        shown = next((v for v in forms if v.hypothesis.joint == 2), forms[0])
+        path = OUT / f"{effect.__name__}.png"
+        draw(diagnosis, shown).write_image(path, width=760, height=210, scale=1)
+        print(path.name, path.stat().st_size)
+
+
+def left(diagnosis: jaxid.Diagnosis, verdict: Verdict) -> Float[np.ndarray, "recordings samples 2"]:
+    """What the effect would leave of the torque once the fit has bent its parameters to it."""
+    data, columns = diagnosis.data, list(verdict.hypothesis.columns)
+    # The first amplitude alone: of a sine and a cosine, one says what both look like.
+    wave = data.table[..., columns[0]]
+    size = np.sqrt(np.mean(wave**2, axis=(0, 1)))
+    weights = 1 / np.sqrt(np.mean(data.residual**2, axis=(0, 1)))
+    base = data.base * weights[:, None]
+    flat = base.reshape(-1, base.shape[-1])
+    bent = np.linalg.lstsq(flat, (wave * weights).ravel(), rcond=None)[0]
+    return (wave - data.base @ bent) / size.max()
+
+
+def telling(diagnosis: jaxid.Diagnosis, wave: np.ndarray, joint: int) -> tuple[Curve, np.ndarray]:
+    """The coordinate, and whether times the sign of velocity, on which the picture depends most."""
+    motion, mask = diagnosis.motion, diagnosis.data.mask
+    y = wave[..., joint - 1][mask]
+    sign = np.sign(np.asarray(motion.v)[..., joint - 1][mask])
+    best, found, along = -1.0, Curve(joint=joint, coordinate="q", of=joint), y
+    for kind in COORDINATES:
+        values = np.asarray(getattr(motion, kind))
+        x = values[..., joint - 1][mask]
+        order = np.array_split(np.argsort(x, kind="stable"), 30)
+        for signed in (False, True):
+            z = y * sign if signed else y
+            rest = sum(np.sum((z[k] - z[k].mean()) ** 2) for k in order)
+            # Plain before signed where both say the same.
+            share = 1 - rest / np.sum((z - z.mean()) ** 2) - 0.02 * signed
+            if share > best:
+                best, along = share, x
+                found = Curve(joint=joint, coordinate=kind, of=joint, signed=signed)
+    return found, along
+
+
+def draw(diagnosis: jaxid.Diagnosis, verdict: Verdict) -> go.Figure:
+    """In time on the left, against the coordinate that shows it on the right."""
+    wave = left(diagnosis, verdict)
+    power = np.mean(wave**2, axis=(0, 1))
+    joint = verdict.hypothesis.joint or int(power.argmax()) + 1
+    recording = int(np.mean(wave[..., joint - 1] ** 2, axis=1).argmax())
+    curve, x = telling(diagnosis, wave, joint)
+    mask, motion = diagnosis.data.mask, diagnosis.motion
+    y = wave[..., joint - 1][mask]
+    if curve.signed:
+        y = y * np.sign(np.asarray(motion.v)[..., joint - 1][mask])
+    figure = make_subplots(rows=1, cols=2, column_widths=[0.6, 0.4], horizontal_spacing=0.09)
+    time, first = diagnosis.fit.recordings[recording].time, wave[recording, mask[recording]]
+    line = {"color": figures.ORANGE, "width": 1.6}
+    figure.add_scatter(x=time, y=first[:, joint - 1], mode="lines", line=line)
+    dots = {"color": figures.BLUE, "size": 3, "opacity": 0.5}
+    few = np.random.default_rng(0).permutation(len(x))[:600]
+    figure.add_scatter(x=x[few], y=y[few], mode="markers", marker=dots, row=1, col=2)
+    torque, position = diagnosis.fit.loop.arm.units()
+    unit = coordinate_unit(curve, torque, position)
+    figure.update_layout(template=figures.theme(), showlegend=False)
+    figure.update_layout(margin={"l": 50, "r": 10, "t": 10, "b": 45})
+    figure.update_xaxes(title_text="time (s)", row=1, col=1)
+    figure.update_xaxes(title_text=f"{curve.spoken_coordinate} ({unit})", row=1, col=2)
+    figure.update_yaxes(showticklabels=False)
+    figure.update_yaxes(title_text=f"torque {joint}", row=1, col=1)
+    figure.update_yaxes(title_text="× sign of v" if curve.signed else None, row=1, col=2)
+    return figure
+
+
+if __name__ == "__main__":
+    main()

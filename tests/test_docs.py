@@ -1,0 +1,96 @@
+"""The documentation builds without a warning, asks nothing of a network, and is complete."""
+
+import os
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import jaxid
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pages, built as strictly as mkdocs can."""
+    for module in ("mkdocs", "material", "mkdocstrings", "latex2mathml"):
+        pytest.importorskip(module, reason="the extra `docs` is not installed")
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(out)]
+    # The theme's own news are no warning of ours.
+    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    built = subprocess.run(
+        command, cwd=ROOT, env=quiet, capture_output=True, text=True, check=False
+    )
+    assert built.returncode == 0, built.stderr
+    assert "WARNING" not in built.stderr
+    return out
+
+
+class Loaded(HTMLParser):
+    """What a page has the browser fetch."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        fetched = {"link": "href", "script": "src", "img": "src", "iframe": "src"}
+        # A page's own address among search engines is a link that nothing fetches.
+        if tag in fetched and given.get("rel") != "canonical":
+            self.addresses += [a for a in [given.get(fetched[tag])] if a]
+
+
+@pytest.mark.slow
+def test_it_builds_and_fetches_nothing_from_elsewhere(site: Path) -> None:
+    pages = sorted(site.rglob("*.html"))
+    assert len(pages) > 15
+    for page in pages:
+        for address in Loaded(page.read_text(encoding="utf-8")).addresses:
+            assert not re.match(r"(https?:)?//", address), f"{page.name} fetches {address}"
+            local = (page.parent / address.split("#")[0].split("?")[0]).resolve()
+            # The page that stands for missing ones has addresses from the site's root.
+            assert local.exists() or page.name == "404.html", f"{page.name} lacks {address}"
+
+
+@pytest.mark.slow
+def test_equations_are_drawn_without_a_script(site: Path) -> None:
+    text = (site / "method.html").read_text(encoding="utf-8")
+    assert text.count("<math") > 15
+    assert "arithmatex" not in re.sub(r"<style.*?</style>", "", text, flags=re.DOTALL)
+    assert "\\" not in "".join(re.findall(r"<math.*?</math>", text, flags=re.DOTALL))
+
+
+@pytest.mark.slow
+def test_the_api_shows_what_daily_names_do(site: Path) -> None:
+    pages = "".join(p.read_text(encoding="utf-8") for p in (site / "api").glob("*.html"))
+    shown = set(re.findall(r'id="(jaxid[\w.]+)"', pages))
+    last = {name.rpartition(".")[2] for name in shown}
+    for name in ("read", "fit", "OEM", "compare", "diagnose", "discover", "ClosedLoop", "Curve"):
+        assert name in last
+    assert "jaxid.discovery.discover.discover" in shown
+
+
+def test_every_effect_of_the_catalogue_is_described_and_drawn() -> None:
+    text = (DOCS / "catalogue.md").read_text(encoding="utf-8")
+    for effect in jaxid.catalogue:
+        name = effect.__name__
+        assert f"(`{name}`)" in text
+        assert f"(img/effects/{name}.png)" in text
+        assert (DOCS / "img" / "effects" / f"{name}.png").stat().st_size > 5000
+
+
+def test_pictures_named_in_the_readme_are_there_and_small() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    named = re.findall(r"\]\((docs/[^)]+)\)", text)
+    assert any(path.endswith(".png") for path in named)
+    for path in named:
+        assert (ROOT / path).is_file(), path
+        assert (ROOT / path).stat().st_size < 400_000

@@ -1,0 +1,137 @@
+"""The page in a real browser: it draws, sorts, zooms and prints, and asks nothing of a network."""
+
+import shutil
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from test_discover_cli import told
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+# What one worker has fitted serves all of them.
+pytestmark = [pytest.mark.xdist_group("demo"), pytest.mark.slow]
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+DRAWN = """() => [...document.querySelectorAll("[data-figure]")].every(
+    (box) => box.querySelector(".main-svg .plot, .main-svg .cartesianlayer path"))"""
+RANGES = """() => [...document.querySelectorAll("[data-linked]")].map(
+    (box) => box.layout.xaxis.range)"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """The system's chromium, headless; skips where there is none."""
+    found = next((path for path in map(shutil.which, NAMES) if path), None)
+    if found is None:
+        pytest.skip(f"none of {', '.join(NAMES)} is installed")
+    with sync_api.sync_playwright() as playwright:
+        running = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield running
+        running.close()
+
+
+class Opened:
+    """The demo's page in a window, and what the browser complained of or asked for."""
+
+    def __init__(self, browser: Any, width: int = 1200, scheme: str = "light") -> None:
+        self.page = browser.new_page(
+            viewport={"width": width, "height": 900}, color_scheme=scheme
+        )
+        self.said: list[str] = []
+        self.asked: list[str] = []
+        self.page.on("console", lambda message: self.said.append(message.text))
+        self.page.on("pageerror", lambda error: self.said.append(str(error)))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.goto(told().page.as_uri())
+        # The page forbids itself to evaluate text, which waiting for a function would do.
+        for _ in range(600):
+            if self.page.evaluate(DRAWN):
+                return
+            self.page.wait_for_timeout(50)
+        raise AssertionError("a figure was not drawn within 30 s")
+
+
+@pytest.fixture(scope="module")
+def opened(browser: Any) -> Opened:
+    """The page in a light window of 1200 px."""
+    return Opened(browser)
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1200, "light"), (1200, "dark"), (400, "light")])
+def test_it_draws_without_complaint_or_request(browser: Any, width: int, scheme: str) -> None:
+    window = Opened(browser, width, scheme)
+    assert window.said == []
+    assert window.asked == [told().page.as_uri()]
+    # Nothing hangs over the edge; wide figures and tables scroll in boxes of their own.
+    assert window.page.evaluate("document.documentElement.scrollWidth") <= width
+    assert window.page.locator("[data-figure]").count() >= 8
+    back = window.page.evaluate("getComputedStyle(document.body).backgroundColor")
+    light = sum(int(x) for x in back.removeprefix("rgb(").removesuffix(")").split(","))
+    assert light > 700 if scheme == "light" else light < 100
+    window.page.close()
+
+
+def _column(table: Any, k: int) -> list[str]:
+    return table.locator(f"tbody tr td:nth-child({k + 1})").all_inner_texts()
+
+
+def test_tables_sort_by_mouse_and_by_keyboard(opened: Opened) -> None:
+    table = opened.page.locator("table", has_text="parameters of the final model")
+    names, values = _column(table, 0), _column(table, 1)
+    by_value = sorted(names, key=lambda name: float(values[names.index(name)].replace("−", "-")))
+    table.get_by_role("button", name="value").click()
+    assert _column(table, 0) == by_value[::-1]
+    opened.page.keyboard.press("Enter")
+    assert _column(table, 0) == by_value
+    head = table.locator("th").nth(1)
+    assert head.get_attribute("aria-sort") == "ascending"
+    table.get_by_role("button", name="parameter").focus()
+    opened.page.keyboard.press("Space")
+    assert _column(table, 0) == sorted(names, key=str.casefold, reverse=True)
+
+
+def test_zoom_is_linked_over_signals_and_obeys_the_keyboard(opened: Opened) -> None:
+    page = opened.page
+    whole = page.evaluate(RANGES)
+    assert len(whole) == 2
+    box = page.locator("[data-linked]").first
+    box.scroll_into_view_if_needed()
+    frame = box.locator(".nsewdrag").first.bounding_box()
+    assert frame is not None
+    x, y = frame["x"] + frame["width"] / 4, frame["y"] + frame["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + frame["width"] / 4, y, steps=4)
+    page.mouse.up()
+    page.wait_for_timeout(300)
+    first, second = page.evaluate(RANGES)
+    assert first == second
+    span = whole[0][1] - whole[0][0]
+    assert first[0] == pytest.approx(whole[0][0] + span / 4, abs=0.02 * span)
+    assert first[1] == pytest.approx(whole[0][0] + span / 2, abs=0.02 * span)
+    # All panels of a figure share its axis of time.
+    assert box.evaluate("box => box.layout.xaxis3.range[1]") == first[1]
+    box.focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("0")
+    page.wait_for_timeout(300)
+    assert page.evaluate(RANGES) == whole
+
+
+def test_figures_follow_a_change_of_theme(opened: Opened) -> None:
+    ink = 'document.querySelector("[data-figure]").layout.font.color'
+    light = opened.page.evaluate(ink)
+    opened.page.emulate_media(color_scheme="dark")
+    opened.page.wait_for_timeout(300)
+    assert opened.page.evaluate(ink) != light
+    opened.page.emulate_media(color_scheme="light")
+    opened.page.wait_for_timeout(300)
+    assert opened.page.evaluate(ink) == light
+
+
+def test_it_prints_what_is_folded_away(opened: Opened) -> None:
+    assert len(opened.page.pdf(format="A4")) > 50_000
+    folded = "document.querySelectorAll('details:not(.raw):not([open])').length"
+    assert opened.page.evaluate(folded) == 0
+    assert opened.said == []
