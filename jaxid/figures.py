@@ -13,10 +13,10 @@ from textwrap import wrap
 from typing import Any, Literal
 
 import numpy as np
-import plotly
 import plotly.graph_objects as go
 import plotly.io as pio
 from jaxtyping import Bool, Float, Real
+from plotly.subplots import make_subplots
 
 Role = Literal["measured", "simulated", "residual", "reference", "band"]
 
@@ -126,7 +126,7 @@ def signals(
     if not panels or not all(panels):
         raise ValueError("signals() draws panels of at least one trace each; one is empty.")
     heights = [1.0 if any(t.role != "residual" for t in panel) else 0.5 for panel in panels]
-    figure = plotly.subplots.make_subplots(
+    figure = make_subplots(
         rows=len(panels), cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=heights
     )
     names = titles or [panel[0].name for panel in panels]
@@ -319,7 +319,7 @@ def autocorrelation(
         bound: Two standard deviations of a white residual's autocorrelation.
         title: Of the whole figure.
     """
-    figure = plotly.subplots.make_subplots(rows=1, cols=1)
+    figure = make_subplots(rows=1, cols=1)
     _add_acf(figure, lags, acf, bound, 1, 1)
     figure.update_xaxes(title_text="lag (samples)")
     figure.update_yaxes(title_text="autocorrelation")
@@ -516,7 +516,7 @@ def shares_in_time(
         title: Of the whole figure.
     """
     together = np.sum(list(shares.values()), axis=0, initial=0.0) + np.zeros_like(residual)
-    figure = plotly.subplots.make_subplots(
+    figure = make_subplots(
         rows=3, cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=[1.0, 1.0, 0.6]
     )
     whole = [
@@ -541,7 +541,7 @@ def shares_in_time(
 
 def _comparison_grid(joints: int) -> go.Figure:
     """Give for each joint a high and a low panel on the left, and one beside both."""
-    return plotly.subplots.make_subplots(
+    return make_subplots(
         rows=2 * joints,
         cols=2,
         specs=[[{}, {"rowspan": 2}], [{}, None]] * joints,

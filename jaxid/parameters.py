@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
@@ -70,9 +71,8 @@ def parameter(
     return eqx.field(converter=as_float64, metadata={"parameter": declaration}, **extra)
 
 
-def known() -> Any:
-    """A field whose module is known: its parameters are numbers, none of the model's own."""
-    return eqx.field(metadata={"known": True})
+# Metadata of a field whose module is known: its parameters are numbers, none of the model's own.
+KNOWN = MappingProxyType({"known": True})
 
 
 class Parameter(eqx.Module):

@@ -84,8 +84,8 @@ def flow(
     if stepping.control is not None:
         return _adaptive(stepping, terms, t0, h, x)
     known = substeps is None
-    substeps = (stepping.substeps or 1) if substeps is None else substeps
-    solver, dt = stepping.solver, h / substeps
+    count = (stepping.substeps or 1) if substeps is None else substeps
+    solver, dt = stepping.solver, h / count
     memory = solver.init(terms, t0, t0 + dt, x, None)
 
     def substep(carry, k):
@@ -95,10 +95,10 @@ def flow(
         return (y, memory), None
 
     if not known:
-        return jax.lax.fori_loop(0, substeps, lambda k, c: substep(c, k)[0], (x, memory))[0]
+        return jax.lax.fori_loop(0, count, lambda k, c: substep(c, k)[0], (x, memory))[0]
     if stepping.substeps in (None, 1):
         return substep((x, memory), 0)[0][0]
-    (x, _), _ = jax.lax.scan(substep, (x, memory), jnp.arange(substeps))
+    (x, _), _ = jax.lax.scan(substep, (x, memory), jnp.arange(stepping.substeps))
     return x
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 # Arrays above this size are left whole: writing a spline's dozen knots out would only make
@@ -66,7 +67,7 @@ class _Value:
 
     @classmethod
     def of(cls, array) -> "_Value":
-        if not isinstance(array, jax.core.Tracer):
+        if not isinstance(array, Tracer):
             array = np.asarray(array)
         return cls(np.shape(array), jnp.result_type(array), array=array)
 
@@ -129,8 +130,8 @@ class _Writer:
 
         def look_up(atom) -> _Value:
             if isinstance(atom, Literal):
-                dtype = atom.aval.dtype
-                return _Value(atom.aval.shape, dtype, np.asarray(atom.val, dtype))
+                kind: Any = atom.aval
+                return _Value(kind.shape, kind.dtype, np.asarray(atom.val, kind.dtype))
             return values[atom]
 
         values.update(zip(jaxpr.constvars, consts, strict=True))

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..parameters import known
+from ..parameters import KNOWN
 from ._base import AbstractController, Reading, Reference
 from .pd import _vector
 
@@ -41,7 +41,7 @@ class ComputedTorque(AbstractController):
     - `window`: ticks.
     """
 
-    model: Body = known()
+    model: Body = eqx.field(metadata=KNOWN)
     Kp: Float[Array, " joints"] = eqx.field(converter=_vector)
     Ki: Float[Array, " joints"] = eqx.field(converter=_vector)
     Kd: Float[Array, " joints"] = eqx.field(converter=_vector)

@@ -171,8 +171,8 @@ def by_width(
     """Places and columns of blocks of equal width together, so that they can be done at once."""
     widths = np.array([len(block) for block in blocks])
     return [
-        (places, np.array([list(blocks[k]) for k in places]))
-        for width in np.unique(widths[widths > 0])
+        (places, np.array([list(blocks[int(k)]) for k in places]))
+        for width in sorted({int(w) for w in widths if w > 0})
         for places in [np.flatnonzero(widths == width)]
     ]
 

@@ -60,7 +60,8 @@ _DOUBTFUL_PERCENT = 30.0
 
 def _doubted(found: Fit) -> Fit:
     """The fit, with what to look at where it leaves more of a signal than a model should."""
-    errors = dict(found.error_percent.max(axis=0))
+    largest = found.error_percent.to_numpy().max(axis=0)
+    errors = {str(c): float(x) for c, x in zip(found.error_percent.columns, largest, strict=True)}
     worst = {label: value for label, value in errors.items() if value > _DOUBTFUL_PERCENT}
     if not worst:
         return found

@@ -164,8 +164,9 @@ class Coefficients(eqx.Module):
             for lag in range(1, orders[i] + 1)
         ]
         size = 8 * -(-len(places) // 8)
-        padded = np.array(places + [(0, 0, 0)] * (size - len(places)), int).reshape(size, 3).T
-        return cls(*(jnp.asarray(x) for x in padded), jnp.arange(size) < len(places))
+        padded = np.array(places + [(0, 0, 0)] * (size - len(places)), int).reshape(size, 3)
+        row, column, lag = (jnp.asarray(x) for x in padded.T)
+        return cls(row, column, lag, jnp.arange(size) < len(places))
 
     def into(
         self, noise: Float[Array, "..."], values: Float[Array, " coefficients"]

@@ -124,7 +124,7 @@ def _converge_jointly(
     upper = jnp.concatenate([bounds.upper, jnp.full(extra, jnp.inf)])
     problem = Problem(
         loop, batch, weights, blank, free, lower, upper, signals, bool(free.any()),
-        coefficients, jnp.eye(outputs),
+        mesh=oem.mesh, coefficients=coefficients, mix=jnp.eye(outputs),
     )  # fmt: skip
     _check_samples(problem, orders)
     theta = jnp.concatenate([loop.theta, jnp.asarray(_starting(problem, noise))])

@@ -45,7 +45,10 @@ class Profile(eqx.Module):
                 ends.append(float(end))
                 continue
             goal = sign * reach
-            ends.append(float(optimize.brentq(lambda x, g=goal: float(along(x)) - g, centre, end)))
+            found = optimize.root_scalar(
+                lambda x, g=goal: float(along(x)) - g, bracket=(float(centre), float(end))
+            )
+            ends.append(float(found.root))
         return ends[0], ends[1]
 
     def __repr__(self) -> str:

@@ -214,9 +214,9 @@ def choose(table: pd.DataFrame, criterion: Criterion, white: float | None = None
     - `white`: significance of the test; None to ask for the criterion alone.
     """
     if white is not None:
-        passing = table[table["ljung_box_p"] > white]
+        passing = table.loc[table["ljung_box_p"] > white]
         table = passing if len(passing) else table
-    return int(table[criterion].idxmin())
+    return int(table.index.to_numpy()[int(np.argmin(table[criterion].to_numpy()))])
 
 
 class Burg(eqx.Module):

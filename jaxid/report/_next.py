@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from ..discovery import Discovery, Limits, next_experiment
+from ..discovery import Discovery, next_experiment
 from ..discovery.diagnose import Diagnosis, Verdict
 from ..errors import JaxidError
+from ..excitation import Limits
 from ._html import Content, figure, number, table, tag
 
 
