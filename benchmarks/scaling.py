@@ -95,7 +95,7 @@ def hypotheses(batch: Batch, counts: tuple[int, ...], budget: float) -> list[dic
     funs = {}
     for count in counts:
         push = jnp.asarray(rng.standard_normal((batch.q0.shape[0], points, 2, count)))
-        funs[count] = lambda push=push: respond(linear, 8, push)
+        funs[count] = lambda push=push: respond(linear, "push", push)
         funs[count]()
     best = interleaved(funs, budget, most=30)
     return [

@@ -33,7 +33,8 @@ def test_peers_simulate_and_differentiate_the_same_loop(tmp_path):
 
 @pytest.mark.slow
 def test_ways_to_a_gradient_agree_as_far_as_each_can(tmp_path):
-    rows = {row["way"]: row for row in _quick("gradients", tmp_path) if row.get("error")}
+    found = _quick("gradients", tmp_path)
+    rows = {row["way"]: row for row in found if row["task"] in ("Jacobian", "gradient")}
     steps = rows["forward mode through the steps"]["error"]
     # Four steps in 10 ms, with a sign as sharp as 100 s/rad.
     assert steps < 2e-3

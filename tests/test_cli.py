@@ -111,7 +111,7 @@ def test_a_fit_that_failed_ends_with_one(monkeypatch, tmp_path):
     file = tmp_path / "slow.py"
     file.write_text("import jaxid\nloop = jaxid.scara().with_values(MX2=9.0)\n")
     monkeypatch.setattr(
-        jaxid.estimate, "OEM", lambda window: jaxid.OEM(window=window, start="given")
+        jaxid.estimate, "OEM", lambda **settings: jaxid.OEM(**settings, start="given")
     )
     result = run("fit", FIT_1, "--robot", f"{file}:loop", "--json", tmp_path / "fit.json")
     assert result.exit_code == 1

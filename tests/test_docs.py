@@ -89,7 +89,7 @@ def test_every_effect_of_the_catalogue_is_described_and_drawn() -> None:
 
 def test_pictures_named_in_the_readme_are_there_and_small() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    named = re.findall(r"\]\((docs/[^)]+)\)", text)
+    named = re.findall(r"\]\((docs/[^)#]+)", text)
     assert any(path.endswith(".png") for path in named)
     for path in named:
         assert (ROOT / path).is_file(), path

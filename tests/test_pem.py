@@ -188,16 +188,6 @@ def test_what_the_data_do_not_allow_is_refused_and_the_fit_kept(fits, recording,
         assert np.allclose(caught.value.fit.theta, fits["oem"].theta)
 
 
-def test_a_torque_that_was_not_recorded_is_refused(recording):
-    flat = np.array(recording.tau)
-    flat[:, 1] = 0.0
-    dead = jaxid.Recording.from_arrays(
-        recording.time, recording.q, flat, q_ref=recording.q_ref, name="dead"
-    )
-    with pytest.raises(NoiseError, match="joint 2 is constant"):
-        jaxid.fit(jaxid.scara(), dead, jaxid.JointPEM(GIVEN, orders=ORDERS))
-
-
 def test_regressions_have_no_bootstrap(recording):
     fit = jaxid.fit(jaxid.scara(), recording, jaxid.IDIM())
     with pytest.raises(FitError, match="fit by OEM, SeparablePEM or JointPEM"):
