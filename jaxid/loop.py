@@ -299,28 +299,48 @@ class Instant(eqx.Module):
     derivative: State
 
 
-def effect_load(
-    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...], curves: bool = True
-) -> Float[Array, " joints"]:
-    """Torque that all effects together ask for at a motion, `(joints,)`.
+def effect_loads(
+    loop: ClosedLoop,
+    motion: Motion,
+    states: tuple[Float[Array, " _"], ...],
+    links: Motion | None = None,
+    *,
+    curves: bool = True,
+    inertia: bool = True,
+) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
+    """Torque that all effects together ask of the drives, and that of the links, `(joints,)` each.
 
     Effects of the load come last, since they are given what the others leave of the torque.
-    `curves` is False to leave out what needs an acceleration that is not known yet.
+
+    **Arguments:**
+
+    - `motion`: of the drives. `states`: the effects' own. `links`: their motion, where they part
+      from the drives.
+    - `curves`: False to leave out what needs an acceleration that is not known yet.
+    - `inertia`: False to leave out what is proportional to acceleration.
     """
+    drive = link = jnp.zeros_like(motion.v)
+    behind = motion if links is None else links
     own = [
         (effect, state)
         for effect, state in zip(loop.effects, states, strict=True)
         if curves or not effect.needs_acceleration
     ]
-    total = jnp.zeros_like(motion.v)
-    for effect, state in own:
-        if not effect.loaded:
-            total = total + effect.torque(dataclasses.replace(motion, state=state))
-    left = dataclasses.replace(motion, tau=motion.tau - total)
     for effect, state in own:
         if effect.loaded:
-            total = total + effect.torque(dataclasses.replace(left, state=state))
-    return total
+            continue
+        seen = dataclasses.replace(behind if effect.on_link else motion, state=state)
+        if effect.inertial and not inertia:
+            seen = dataclasses.replace(seen, a=jnp.zeros_like(seen.a))
+        if effect.on_link:
+            link = link + effect.torque(seen)
+        else:
+            drive = drive + effect.torque(seen)
+    left = dataclasses.replace(motion, tau=motion.tau - drive)
+    for effect, state in own:
+        if effect.loaded:
+            drive = drive + effect.torque(dataclasses.replace(left, state=state))
+    return drive, link
 
 
 def inverse(
@@ -328,7 +348,7 @@ def inverse(
 ) -> Float[Array, " joints"]:
     """Torque at the joints that a motion takes (the inverse dynamic model), `(joints,)`."""
     rigid = loop.arm.mass_matrix(motion.q) @ motion.a + loop.arm.bias(motion.q, motion.v)
-    return rigid + effect_load(loop, motion, states)
+    return rigid + sum(effect_loads(loop, motion, states), jnp.zeros(()))
 
 
 def _added_inertia(
@@ -398,44 +418,52 @@ def _accelerations(
     added = _added_inertia(loop, motion, state.effects)
     matrix = loop.arm.mass_matrix(state.q) + added
     bias = loop.arm.bias(state.q, state.v)
+    own = state.effects
     if any(effect.needs_acceleration for effect in loop.effects):
-        without = motion.tau - effect_load(loop, motion, state.effects, curves=False) + push
+        drive, link = effect_loads(loop, motion, own, curves=False)
+        without = motion.tau - drive - link + push
         motion = dataclasses.replace(motion, a=solve_positive(matrix, without - bias))
-    load = effect_load(loop, motion, state.effects)
-    # Inertia is on the left-hand side already.
-    available = motion.tau - load + added @ motion.a + push
     transmissions = [
         (k, e) for k, e in enumerate(loop.effects) if isinstance(e, AbstractTransmission)
     ]
-    if not transmissions:
-        return solve_positive(matrix, available - bias), {}
-    return _through_transmissions(loop, state, transmissions, available, added)
+    if transmissions:
+        return _through_transmissions(loop, motion, state, transmissions, push, added)
+    # What is proportional to acceleration is on the left-hand side already.
+    drive, link = effect_loads(loop, motion, own, inertia=False)
+    return solve_positive(matrix, motion.tau - drive - link + push - bias), {}
 
 
 def _through_transmissions(
     loop: ClosedLoop,
+    motion: Motion,
     state: State,
     transmissions: list[tuple[int, AbstractTransmission]],
-    available: Float[Array, " joints"],
+    push: Float[Array, " joints"],
     added: Float[Array, "joints joints"],
 ) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
     """Rotors on the drive's side, the rest of the inertia on the link's (Spong 1987)."""
-    q, v, on_link, rotors = state.q, state.v, available, jnp.zeros_like(state.q)
+    q, v = state.q, state.v
+    rotors = passed = jnp.zeros_like(q)
+    apart = jnp.zeros_like(q, bool)
     for k, transmission in transmissions:
         j, there = transmission.joint - 1, transmission.present()
         twist, rate = jnp.where(there, state.effects[k], 0.0)
         q, v = q.at[j].add(twist), v.at[j].add(rate)
-        passed = transmission.through(twist, rate)
-        on_link = on_link.at[j].set(jnp.where(there, passed, on_link[j]))
+        passed = passed.at[j].set(transmission.through(twist, rate))
+        apart = apart.at[j].set(there)
         rotors = rotors.at[j].set(jnp.where(there, transmission.rotor, 0.0))
+    links = dataclasses.replace(motion, q=q, v=v)
+    drive, held = effect_loads(loop, motion, state.effects, links, inertia=False)
+    available = motion.tau - drive + push
+    on_link = jnp.where(apart, passed, available)
     matrix = loop.arm.mass_matrix(q) + added - jnp.diag(rotors)
-    link = solve_positive(matrix, on_link - loop.arm.bias(q, v))
+    link = solve_positive(matrix, on_link - held - loop.arm.bias(q, v))
     a, twisting = link, {}
     for k, transmission in transmissions:
         j, there = transmission.joint - 1, transmission.present()
-        drive = (available[j] - on_link[j]) / transmission.rotor
-        a = a.at[j].set(jnp.where(there, drive, link[j]))
-        twisting[k] = jnp.where(there, link[j] - drive, 0.0)
+        turned = (available[j] - on_link[j]) / transmission.rotor
+        a = a.at[j].set(jnp.where(there, turned, link[j]))
+        twisting[k] = jnp.where(there, link[j] - turned, 0.0)
     return a, twisting
 
 

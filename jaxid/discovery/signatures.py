@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..effects import AbstractEffect, AbstractTransmission, Coulomb, Curve, Motion, Scene
 from ..effects.curve import curve_over
 from ..errors import ModelError
-from ..loop import ClosedLoop, effect_load
+from ..loop import ClosedLoop, effect_loads
 from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..recording import Recordings
 from ..simulate import Batch, initial, run
@@ -194,11 +194,11 @@ def _forces(
 
 @eqx.filter_jit
 def _left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings points joints"]:
-    """Torque that the loop's own effects leave for the links along the runs."""
+    """Torque that the loop's own effects on the drives leave for the links along the runs."""
 
     def remaining(at: Motion):
         states = tuple(effect.initial_state() for effect in loop.effects)
-        return at.tau - effect_load(loop, at, states)
+        return at.tau - effect_loads(loop, at, states)[0]
 
     return jax.vmap(jax.vmap(remaining))(motion)
 
