@@ -285,6 +285,18 @@ def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Fl
     return jnp.stack(x)
 
 
+class Outside(eqx.Module):
+    """What comes from outside the loop at one instant; vectors are `(joints,)`.
+
+    `push` is torque on the drives, `pull` on the links (the same where nothing gives way between
+    them), `noise` is added to what the sensors read.
+    """
+
+    push: Float[Array, " joints"]
+    pull: Float[Array, " joints"]
+    noise: Reading
+
+
 class Instant(eqx.Module):
     """Everything about one instant of the loop; vectors are `(joints,)`.
 
@@ -372,8 +384,7 @@ def instant(
     t: Float[Array, ""],
     state: State,
     reference: Reference,
-    push: Float[Array, " joints"],
-    noise: Reading,
+    outside: Outside,
     label: Int[Array, ""],
 ) -> Instant:
     """The closed loop at one instant: what is read, commanded and delivered, and what follows.
@@ -383,12 +394,11 @@ def instant(
     - `t`: time, s.
     - `state`: of the loop.
     - `reference`: what the controller is asked for.
-    - `push`: torque on the joints from outside, `(joints,)`, N·m or N.
-    - `noise`: added to what the sensors read.
+    - `outside`: what acts on it.
     - `label`: which recording.
     """
     seen = read(loop, state.q, state.v)
-    seen = Reading(seen.q + noise.q, seen.v + noise.v)
+    seen = Reading(seen.q + outside.noise.q, seen.v + outside.noise.v)
     mass = loop.arm.mass_matrix(state.q)
     command = loop.controller.command(seen, reference, state.controller, mass)
     tau = loop.controller.acting(command, state.controller)
@@ -399,7 +409,7 @@ def instant(
         arriving.append(motion.tau)
         seen_by = dataclasses.replace(motion, state=own)
         motion = dataclasses.replace(motion, tau=effect.command(seen_by))
-    a, twisting = _accelerations(loop, motion, state, push)
+    a, twisting = _accelerations(loop, motion, state, outside)
     rates = []
     for k, (effect, own) in enumerate(zip(loop.effects, state.effects, strict=True)):
         if k in twisting:
@@ -412,7 +422,7 @@ def instant(
 
 
 def _accelerations(
-    loop: ClosedLoop, motion: Motion, state: State, push: Float[Array, " joints"]
+    loop: ClosedLoop, motion: Motion, state: State, outside: Outside
 ) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
     """Accelerations of the drives, and of the twist of each transmission by its place."""
     added = _added_inertia(loop, motion, state.effects)
@@ -421,16 +431,17 @@ def _accelerations(
     own = state.effects
     if any(effect.needs_acceleration for effect in loop.effects):
         drive, link = effect_loads(loop, motion, own, curves=False)
-        without = motion.tau - drive - link + push
+        without = motion.tau - drive - link + outside.push + outside.pull
         motion = dataclasses.replace(motion, a=solve_positive(matrix, without - bias))
     transmissions = [
         (k, e) for k, e in enumerate(loop.effects) if isinstance(e, AbstractTransmission)
     ]
     if transmissions:
-        return _through_transmissions(loop, motion, state, transmissions, push, added)
+        return _through_transmissions(loop, motion, state, transmissions, outside, added)
     # What is proportional to acceleration is on the left-hand side already.
     drive, link = effect_loads(loop, motion, own, inertia=False)
-    return solve_positive(matrix, motion.tau - drive - link + push - bias), {}
+    torque = motion.tau - drive - link + outside.push + outside.pull
+    return solve_positive(matrix, torque - bias), {}
 
 
 def _through_transmissions(
@@ -438,7 +449,7 @@ def _through_transmissions(
     motion: Motion,
     state: State,
     transmissions: list[tuple[int, AbstractTransmission]],
-    push: Float[Array, " joints"],
+    outside: Outside,
     added: Float[Array, "joints joints"],
 ) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
     """Rotors on the drive's side, the rest of the inertia on the link's (Spong 1987)."""
@@ -454,10 +465,11 @@ def _through_transmissions(
         rotors = rotors.at[j].set(jnp.where(there, transmission.rotor, 0.0))
     links = dataclasses.replace(motion, q=q, v=v)
     drive, held = effect_loads(loop, motion, state.effects, links, inertia=False)
-    available = motion.tau - drive + push
+    available = motion.tau - drive + outside.push
     on_link = jnp.where(apart, passed, available)
     matrix = loop.arm.mass_matrix(q) + added - jnp.diag(rotors)
-    link = solve_positive(matrix, on_link - held - loop.arm.bias(q, v))
+    reaching = on_link - held + outside.pull
+    link = solve_positive(matrix, reaching - loop.arm.bias(q, v))
     a, twisting = link, {}
     for k, transmission in transmissions:
         j, there = transmission.joint - 1, transmission.present()

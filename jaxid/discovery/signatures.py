@@ -284,7 +284,6 @@ def signatures(
         reading = np.flatnonzero(np.asarray(jnp.any(noise != 0, axis=(0, 1, 2))))
         if len(reading):
             table[..., reading] += respond(linear, "noise", noise[..., reading])
-        blocks.append(table)
         for _, places in groups:
             low, high = _amplitude_bounds(proposed[direct[places[0]]][0])
             for place in places:
@@ -292,6 +291,10 @@ def signatures(
                 columns = tuple(range(at, at + len(low)))
                 made[direct[place]] = Hypothesis(effect, columns, low, high, tests)
                 at += len(low)
+        behind = [c for h in made.values() if h.effect.on_link for c in h.columns]
+        if "pull" in linear.places and behind:
+            table[..., behind] = respond(linear, "pull", push[..., np.array(behind)])
+        blocks.append(table)
     rest = [k for k in range(len(proposed)) if k not in made]
     for stacked, places in _grouped([proposed[k][0] for k in rest]):
         say(f"{stacked.effect_name()} by simulation")
