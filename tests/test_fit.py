@@ -13,6 +13,7 @@ from jaxid.control import OpenLoop, Tracking
 from jaxid.effects import TorqueOffset
 from jaxid.errors import FitError, RecordingError
 from jaxid.estimate import _least_squares as ls
+from jaxid.estimate._base import determined_covariance
 
 # What one worker has fitted serves all of them.
 pytestmark = pytest.mark.xdist_group("fit")
@@ -311,3 +312,11 @@ def test_a_step_into_bounds_is_the_best_within_them():
         assert np.all(np.abs(step) <= 0.02)
         # Freezing what overshoots is not an exact quadratic program, but most of one.
         assert 0.8 * promised <= gain <= promised * (1 + 1e-6)
+
+
+def test_derivatives_that_overflow_give_no_deviations():
+    """A loop close to running away: said, not raised from inside a linear algebra library."""
+    information = np.diag([1.0, np.inf])
+    covariance, said = determined_covariance(information, ("a", "b"), np.ones(2))
+    assert np.isinf(covariance).all()
+    assert "no finite derivatives" in said[0]

@@ -436,23 +436,22 @@ class _Search(eqx.Module):
         say: Callable[[str], None],
         longest: int = 2,
     ) -> tuple[Step, ...]:
-        """Steps by which effects together do as well as the curve that none matches alone.
+        """Steps by which effects together leave nothing, where none alone matches the best curve.
 
         Screening sees each effect beside a model that lacks the other, and a curve may take a part
-        of both; a second effect shows its true size only when the first is in.
+        of both; a second effect shows its true size only when the first is in. That they match the
+        curve is not enough: ripples in a row come close to any dependence on position.
         """
-        noise = start.diagnosis.noise
-        before = self.criterion(start.fit, noise)
         steps = [start]
         while contenders and len(steps) <= longest:
             last = steps[-1]
             if contenders[0].criterion >= self.criterion(last.fit, last.diagnosis.noise):
                 break
             steps.append(self.grown(last, contenders, say))
-            gained = before - self.criterion(steps[-1].fit, noise)
-            if not _curve_is_better(start.diagnosis, gained):
+            matters = self.matters([start, steps[-1]])
+            left = _entries(steps[-1].diagnosis, matters)
+            if not left and not any(map(matters, steps[-1].diagnosis.where)):
                 return tuple(steps[1:])
-            left = _entries(steps[-1].diagnosis, self.matters([start, steps[-1]]))
             contenders = self.contenders(steps[-1], left, say)
         return ()
 

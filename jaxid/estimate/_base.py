@@ -237,6 +237,9 @@ def determined_covariance(
     - `names`: of its rows. `scales`: typical sizes of these parameters.
     - `meat`: covariance of the score where it is not `information`; gives the sandwich.
     """
+    if not np.isfinite(information).all():
+        sentence = "the simulated signals have no finite derivatives at these values"
+        return np.full_like(information, np.inf), (sentence,)
     size = np.sqrt(np.maximum(np.diag(information), 0))
     # Ten thousand times a parameter's usual size without a trace in the signals: its column is
     # what rounding left of a motion that was not made.

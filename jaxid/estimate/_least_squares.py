@@ -362,16 +362,18 @@ def products(
     else:
         s = found.start.reshape(count, r.shape[1], -1) * problem.free[:, None, None]
     loss = jnp.sum(r**2)
-    sound = jnp.isfinite(loss) & jnp.all(jnp.isfinite(j)) & jnp.all(jnp.isfinite(s))
+    gram, start_gram = jnp.einsum("rkp,rkq->pq", j, j), jnp.einsum("rka,rkb->rab", s, s)
+    # By the squares: a loop close to running away has derivatives that are finite and useless.
+    sound = jnp.isfinite(loss) & jnp.isfinite(jnp.sum(gram)) & jnp.isfinite(jnp.sum(start_gram))
     sound = sound & (loop.arm.smallest_inertia() > 0)
     return Point(
         theta,
         start,
         found,
         jnp.where(sound, loss, jnp.inf),
-        jnp.einsum("rkp,rkq->pq", j, j),
+        gram,
         jnp.einsum("rkp,rk->p", j, r),
-        jnp.einsum("rka,rkb->rab", s, s),
+        start_gram,
         jnp.einsum("rka,rk->ra", s, r),
         jnp.einsum("rka,rkp->rap", s, j),
     )
@@ -493,10 +495,14 @@ def minimise(
     for k in range(2, max_steps + 1):
         if time.perf_counter() > deadline:
             return Minimum(point, Status.max_seconds, k - 1)
-        # What a full step promises, in units of the residual's own spread.
-        if _step(problem, point, scales, 1e-10)[2] <= tolerance**2 * float(point.loss) / count:
+        # A loop close to running away has derivatives whose squares overflow: such a step comes out
+        # as nothing, is refused like any other, and damping grows.
+        with np.errstate(over="ignore", invalid="ignore"):
+            # What a full step promises, in units of the residual's own spread.
+            promised = _step(problem, point, scales, 1e-10)[2]
+            step, start_step, gain = _step(problem, point, scales, damping)
+        if promised <= tolerance**2 * float(point.loss) / count:
             return Minimum(point, Status.converged, k - 1)
-        step, start_step, gain = _step(problem, point, scales, damping)
         ahead = np.asarray(point.theta) + step, np.asarray(point.start) + start_step
         trial = linearise(problem, *map(jnp.asarray, ahead))
         say(f"iteration {k}, weighted squared error {float(trial.loss):.6g}")
