@@ -400,7 +400,7 @@ class _Search(eqx.Module):
             return "outside_catalogue" if outside else done, ()
         contenders = self.contenders(last, entries, say)
         if outside and not self.convinces(contenders, last):
-            contenders = self.second_thoughts(contenders, last, say)
+            contenders = self.second_thoughts(contenders, entries, last, say)
         if self.convinces(contenders, last):
             return None, (self.grown(last, contenders, say),)
         if outside and len(steps) < most and (further := self.detour(last, contenders, say)):
@@ -481,17 +481,24 @@ class _Search(eqx.Module):
         return best in pair or not _curve_is_better(last.diagnosis, gained)
 
     def second_thoughts(
-        self, contenders: Sequence[Contender], last: Step, say: Callable[[str], None]
+        self,
+        contenders: Sequence[Contender],
+        entries: Sequence[Verdict],
+        last: Step,
+        say: Callable[[str], None],
     ) -> list[Contender]:
         """More contenders, before anything is called outside the catalogue.
 
-        Two effects that only together explain it; and elasticity and backlash, since a drive and a
+        Entries further behind, since a shape between those of the grid may explain twice as much;
+        two effects that only together explain it; and elasticity and backlash, since a drive and a
         link that come apart are far from what a small setting shows of them.
         """
         tried = {(c.name, c.joint) for c in contenders}
-        others = {v.key: v for v in (*last.diagnosis.pair, *_transmissions(last.diagnosis))}
-        more = self.refit(last, [v for key, v in others.items() if key not in tried], say)
-        return sorted([*contenders, *more], key=_criterion)
+        behind = [v for v in entries[:6] if v.evidence > 0.5 * entries[0].evidence]
+        more = (*behind, *last.diagnosis.pair, *_transmissions(last.diagnosis))
+        others = {v.key: v for v in more}
+        found = self.refit(last, [v for key, v in others.items() if key not in tried], say)
+        return sorted([*contenders, *found], key=_criterion)
 
     def confirmed(self, last: Step, say: Callable[[str], None]) -> bool:
         """Whether the curve that explains most is more than chance.
