@@ -12,7 +12,7 @@ import plotly.graph_objects as go
 from .. import figures
 from ..discovery import Discovery
 from ..discovery.diagnose import Diagnosis, Verdict
-from ..discovery.discover import Contender, Step
+from ..discovery.story import Contender, Step
 from ..recording import Recording
 from ._html import Content, Markup, details, figure, join, link, number, probability, table, tag
 from ._next import recommended

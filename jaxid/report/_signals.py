@@ -8,8 +8,8 @@ from scipy.ndimage import uniform_filter1d
 from .. import figures
 from ..discovery import Comparison, Discovery, compare
 from ..discovery.diagnose import Verdict, coordinate_unit
-from ..discovery.discover import Step
 from ..discovery.score import whitened
+from ..discovery.story import Step
 from ..effects import Curve
 from ..noise import autocorrelation
 from ._html import Markup, figure

@@ -1,0 +1,272 @@
+"""The story that a discovery tells: its steps, its verdict, how it shows itself."""
+
+import html
+import os
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import equinox as eqx
+import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
+from jaxtyping import Float
+
+from .. import figures
+from ..effects import AbstractEffect, Curve
+from ..errors import ModelError
+from ..estimate import Fit
+from ..loop import ClosedLoop
+from ..saved import save
+from ..showing import AbstractShown
+from .compare import Comparison
+from .diagnose import Diagnosis, effect_parameters
+
+Outcome = Literal["adequate", "explained", "outside_catalogue"]
+
+
+class Contender(eqx.Module):
+    """One effect, added and refitted, with how well it does."""
+
+    name: str
+    joint: int | None
+    fit: Fit
+    criterion: float
+
+
+class Step(eqx.Module):
+    """One turn of the loop: the model so far, and what was found in it.
+
+    `added` is the effect that this step's model has over the last one's; `alike` what these
+    recordings cannot tell from it; `contenders` all that were refitted.
+    """
+
+    label: str
+    fit: Fit
+    held_out: Comparison | None
+    diagnosis: Diagnosis
+    added: AbstractEffect | None = None
+    alike: tuple[tuple[str, int | None], ...] = ()
+    contenders: tuple[Contender, ...] = ()
+
+
+class Discovery(AbstractShown):
+    """The story: what the model lacked, step by step, and where it stopped.
+
+    - `verdict`: `"adequate"`, `"explained"` or `"outside_catalogue"`.
+    - `steps`: the first is the starting model.
+    - `removed`: effects that were added and later found not to be needed.
+    """
+
+    verdict: Outcome = eqx.field(static=True)
+    steps: tuple[Step, ...]
+    removed: tuple[tuple[str, int | None], ...] = ()
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    seconds: float = eqx.field(static=True, default=0.0)
+
+    @property
+    def fit(self) -> Fit:
+        """The last fit."""
+        return self.steps[-1].fit
+
+    @property
+    def loop(self) -> ClosedLoop:
+        """The model at the end."""
+        return self.fit.loop
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """The diagnosis of the model at the end."""
+        return self.steps[-1].diagnosis
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in a sentence for a colleague."""
+        added = _spoken(self.steps)
+        if self.verdict == "adequate":
+            return (
+                f"The model of {self.loop.name} describes these recordings down to their noise: "
+                "nothing is missing."
+            )
+        if self.verdict == "explained":
+            return f"The model lacked {' and '.join(added)}; with that, nothing is left to explain."
+        after = f" after adding {' and '.join(added)}" if added else ""
+        left = f"Something is left{after} that no effect of the catalogue explains"
+        if not self.diagnosis.depends_on():
+            return f"{left}."
+        hypothesis = self.diagnosis.where[0].hypothesis
+        curve = hypothesis.effect
+        assert isinstance(curve, Curve)
+        on = "time" if curve.coordinate == "t" else f"the {curve.spoken_coordinate}"
+        how = " and on the direction of motion" if curve.signed else ""
+        return (
+            f"{left}: the torque of joint {hypothesis.joint} depends on {on}{how} in a way the "
+            "model lacks."
+        )
+
+    def table(self) -> pd.DataFrame:
+        """Error by step and joint, on fitted and held-out recordings, %."""
+        rows = []
+        for step in self.steps:
+            row: dict[str, Any] = {"step": step.label}
+            for j, x in enumerate(_rms(step.fit.error_percent), start=1):
+                row[f"fit, joint {j}"] = x
+            if step.held_out is not None:
+                for j, x in enumerate(_rms(step.held_out.error_percent), start=1):
+                    row[f"held out, joint {j}"] = x
+            rows.append(row)
+        return pd.DataFrame(rows).set_index("step")
+
+    def plot(self) -> go.Figure:
+        """The error falling, step by step, with the noise floor."""
+        series = {"fitted": np.stack([_rms(s.fit.error_percent) for s in self.steps])}
+        if all(s.held_out is not None for s in self.steps):
+            series["held out"] = np.stack(
+                [_rms(s.held_out.error_percent) for s in self.steps if s.held_out is not None]
+            )
+        labels = [step.label for step in self.steps]
+        return figures.error_falling(labels, series, self.noise_floor_percent())
+
+    def noise_floor_percent(self) -> Float[np.ndarray, " joints"]:
+        """Relative error that a perfect model would leave on the fitted recordings, %."""
+        return self.diagnosis.floor_percent()
+
+    def suggestion(self) -> Curve:
+        """The free-form curve that explains most of what is left, ready to be added.
+
+        **Raises:** `ModelError` where nothing is left.
+        """
+        if not self.diagnosis.depends_on():
+            raise ModelError("nothing significant is left, so there is no curve to suggest")
+        curve = self.diagnosis.predicted(self.diagnosis.where[0])
+        assert isinstance(curve, Curve)
+        return curve
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Writes the story to one file, from which `jaxid.load` gives it back.
+
+        **Arguments:**
+
+        - `path`: by convention with the ending `.jaxid`; a file that is there is replaced.
+
+        **Raises:** `SaveError` where it cannot be written.
+        """
+        return save(self, path)
+
+    def report(self, path: str | Path) -> Path:
+        """Writes the story as one self-contained HTML page.
+
+        **Arguments:**
+
+        - `path`: the file to write; its folder must exist.
+
+        **Raises:** `ModelError` where the folder does not exist.
+        """
+        # The page stands on a higher floor: nothing here depends on it but this call.
+        from ..report import write
+
+        return write(self, path)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The story as plain JSON, as `jaxid discover --json` writes it."""
+        first, last = self.steps[0], self.steps[-1]
+        outside = self.verdict == "outside_catalogue"
+        return {
+            "robot": self.loop.name,
+            "verdict": self.verdict,
+            "ranking": first.diagnosis.to_dict()["ranking"],
+            "added": [
+                {
+                    "effect": step.added.effect_name(),
+                    "joint": getattr(step.added, "joint", None),
+                    "parameters": _found_parameters(self.steps, k),
+                    "indistinguishable": [{"effect": n, "joint": j} for n, j in step.alike],
+                }
+                for k, step in enumerate(s for s in self.steps if s.added is not None)
+                if step.added is not None
+            ],
+            "depends_on": last.diagnosis.depends_on() if outside else [],
+            "error_percent": {"before": _errors(first), "after": _errors(last)},
+            "noise_floor_percent": self.noise_floor_percent().tolist(),
+            "sentence": self.sentence,
+            "removed": [{"effect": n, "joint": j} for n, j in self.removed],
+            "notes": list(self.notes),
+            "seconds": self.seconds,
+        }
+
+    def __repr__(self) -> str:
+        lines = [f"{self.verdict}: {self.sentence}", "relative error, %:"]
+        lines.append(self.table().to_string(float_format=lambda x: f"{x:.3f}"))
+        floor = ", ".join(f"{x:.3f}" for x in self.noise_floor_percent())
+        lines.append(f"noise floor, %: {floor}")
+        for k, step in enumerate(s for s in self.steps if s.added is not None):
+            values = _found_parameters(self.steps, k)
+            shown = ", ".join(
+                f"{n} {p['value']:.4g}"
+                + (f" ± {p['std']:.2g}" if p["std"] is not None else "")
+                + f" {p['unit']}"
+                for n, p in values.items()
+            )
+            lines.append(f"{step_name(step)}: {shown}")
+            if step.alike:
+                others = ", ".join(effect_on(n, j) for n, j in step.alike)
+                lines.append(f"  these recordings cannot tell it from {others}")
+        return "\n".join([*lines, *self.notes])
+
+    def _repr_html_(self) -> str:
+        errors = self.table().rename(columns=lambda name: f"{name}, %")
+        floor = ", ".join(f"{x:.3f} %" for x in self.noise_floor_percent())
+        found = repr(self).split("noise floor, %:")[1].split("\n")[1:]
+        lines = "".join(f"<li>{html.escape(line)}</li>" for line in found)
+        return (
+            f"<p><b>{html.escape(self.sentence)}</b></p><p>relative error by step</p>"
+            f"{errors.to_html(float_format='%.3f')}<p>noise floor by joint: {floor}</p>"
+            f"<ul>{lines}</ul>"
+        )
+
+
+def effect_on(name: str, joint: int | None) -> str:
+    """An effect's name and its joint, if it has one, as a sentence has them."""
+    return name + ("" if joint is None else f" on joint {joint}")
+
+
+def _spoken(steps: Sequence[Step]) -> list[str]:
+    """Added effects in words; what was added twice is said once."""
+    effects = [step.added for step in steps if step.added is not None]
+    counted = Counter(effect_on(e.spoken(), getattr(e, "joint", None)) for e in effects)
+    often = {1: "", 2: " twice"}
+    return [name + often.get(n, f" {n} times") for name, n in counted.items()]
+
+
+def step_name(step: Step) -> str:
+    """What a step added, by name and joint."""
+    assert step.added is not None
+    return effect_on(step.added.effect_name(), getattr(step.added, "joint", None))
+
+
+def _rms(table: pd.DataFrame) -> Float[np.ndarray, " joints"]:
+    return np.sqrt(np.mean(table.to_numpy() ** 2, axis=0))
+
+
+def _errors(step: Step) -> dict[str, list[float]]:
+    errors = {"fit": _rms(step.fit.error_percent).tolist()}
+    if step.held_out is not None:
+        errors["validate"] = _rms(step.held_out.error_percent).tolist()
+    return errors
+
+
+def _found_parameters(steps: Sequence[Step], added: int) -> dict[str, dict[str, Any]]:
+    """Values of the added-th added effect in the last fit; added effects stand last in the loop."""
+    fit = steps[-1].fit
+    total = sum(step.added is not None for step in steps)
+    effect = fit.loop.effects[len(fit.loop.effects) - total + added]
+    std = fit.std
+    return {
+        name: {
+            "value": float(fit.theta[place]),
+            "std": float(std[place]) if np.isfinite(std[place]) else None,
+            "unit": unit,
+        }
+        for place, name, unit in effect_parameters(fit.loop, effect)
+    }
