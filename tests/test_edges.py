@@ -88,6 +88,41 @@ def test_what_no_robot_reaches_is_refused(case: Any, signal: str) -> None:
         record(case, "fit_1", **{signal: 1e200 * case.recordings["fit_1"][signal]})
 
 
+def seen(case: Any, counts: int) -> list[jaxid.Recording]:
+    """The pair, its joints read by encoders of so many counts a turn."""
+    step = 2 * np.pi / counts
+    return [
+        record(case, n, q=np.round(case.recordings[n]["q_true"] / step) * step)
+        for n in ("fit_1", "fit_2")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("counts", "cutoff", "ends"),
+    [
+        (40_000, None, jaxid.Status.converged),
+        (1000, 40.0, jaxid.Status.misfit),
+        (100, 20.0, jaxid.Status.unphysical),
+    ],
+)
+def test_settled_is_not_enough_for_success(
+    case: Any, counts: int, cutoff: float | None, ends: jaxid.Status
+) -> None:
+    # An acceleration drowned in encoder steps: the values settle, and explain nothing.
+    fit = jaxid.fit(jaxid.scara(), seen(case, counts), jaxid.IDIMIV(jaxid.Filtering(cutoff)))
+    assert fit.status is ends
+    assert bool(fit.notes) != fit.succeeded
+    sound(fit)
+
+
+def test_a_motor_wired_the_other_way_round_is_no_success(case: Any) -> None:
+    wrong = [record(case, n, tau=-case.recordings[n]["tau"]) for n in ("fit_1", "fit_2")]
+    for method in (jaxid.IDIM(), jaxid.IDIMIV(), jaxid.DIDIM()):
+        fit = jaxid.fit(jaxid.scara(), wrong, method)
+        assert fit.status is jaxid.Status.unphysical
+        sound(fit)
+
+
 # --- models ---------------------------------------------------------------------------------------
 
 

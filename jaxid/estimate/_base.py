@@ -31,6 +31,8 @@ class Status(enum.Enum):
     max_seconds = "reached its limit of time; raise max_seconds"
     diverged = "no parameter values were found at which the loop can be simulated"
     overflowed = "its numbers leave what float64 holds; check the units of the recordings"
+    unphysical = "ended at values that no robot has: the mass matrix is not positive definite"
+    misfit = "describes the recordings no better than no model would"
 
 
 class Fit(AbstractShown):

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
+from jaxtyping import Float
 
 from ..errors import FitError
 from ..loop import ClosedLoop
@@ -59,7 +60,13 @@ _DOUBTFUL_PERCENT = 30.0
 
 
 def _doubted(found: Fit) -> Fit:
-    """The fit, with what to look at where it leaves more of a signal than a model should."""
+    """The fit, with what to look at where it leaves more of a signal than a model should.
+
+    It is no success where no signal is explained at all, or one is left larger than it was.
+    """
+    left = _left_percent(found)
+    if found.succeeded and (left.min() > 99.0 or left.max() > 105.0):
+        found = dataclasses.replace(found, status=Status.misfit)
     largest = found.error_percent.to_numpy().max(axis=0)
     errors = {str(c): float(x) for c, x in zip(found.error_percent.columns, largest, strict=True)}
     worst = {label: value for label, value in errors.items() if value > _DOUBTFUL_PERCENT}
@@ -71,3 +78,13 @@ def _doubted(found: Fit) -> Fit:
         "units, signs, the control law and its gains, and whether there is more motion than noise"
     )
     return dataclasses.replace(found, notes=(*found.notes, note))
+
+
+def _left_percent(found: Fit) -> Float[np.ndarray, " joints"]:
+    """Relative error of each joint over all recordings; of a signal that is nil there is none."""
+    errors = found.error_percent.to_numpy()
+    left = np.array([np.linalg.norm(r, axis=0) for r in found.residuals])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = np.where(errors > 0, left / errors, 0.0)
+        total = np.linalg.norm(left, axis=0) / np.linalg.norm(size, axis=0)
+    return np.where(np.isfinite(total), total, 0.0)

@@ -11,7 +11,7 @@ from ..errors import FitError
 from ..loop import ClosedLoop
 from ..parameters import Bounds, write_values
 from ..recording import Recordings
-from ..simulate import Simulated, simulate
+from ..simulate import Simulated, compared, simulate
 from ._base import AbstractMethod, Fit, Status
 from ._regression import Filtering, linear_parameters
 from .idim import Solved, Stacked, Weights, regression_fit, solve, stack
@@ -46,6 +46,15 @@ def _explaining(recordings: Recordings, runs: tuple[Simulated, ...]) -> list[Sim
     ]
 
 
+def _explained(loop: ClosedLoop, recordings: Recordings, runs: tuple[Simulated, ...]) -> bool:
+    """Whether no joint's simulated torque is further from the measured one than zero would be."""
+    measured = compared(loop, recordings, [r.tau for r in recordings])
+    simulated = compared(loop, recordings, [np.asarray(run.tau) for run in runs])
+    pairs = list(zip(measured, simulated, strict=True))
+    left = sum(np.sum((m - s) ** 2, axis=0) for m, s in pairs)
+    return bool(np.all(left <= 1.05**2 * sum(np.sum(m**2, axis=0) for m, _ in pairs)))
+
+
 class _Iterated(AbstractMethod):
     filtering: eqx.AbstractVar[Filtering]
     weights: eqx.AbstractVar[Weights]
@@ -70,10 +79,16 @@ class _Iterated(AbstractMethod):
                 status = Status.diverged
                 break
             stacked, solved = self.solve_once(loop, recordings, _explaining(recordings, runs))
-            loop = physical(loop, solved.theta)
+            moved = physical(loop, solved.theta)
+            if moved is loop:
+                # Another regression on the same motion would give the same, and look settled.
+                status = Status.unphysical
+                break
+            loop = moved
             change = np.inf if before is None else np.abs(solved.theta - before)
             if np.all(change <= self.tolerance * np.abs(solved.theta)):
-                status = Status.converged
+                settled = _explained(loop, recordings, runs)
+                status = Status.converged if settled else Status.misfit
                 break
             before = solved.theta
         if stacked is None or solved is None:
