@@ -129,8 +129,12 @@ class Diagnosis(AbstractShown):
         """Largest correlation of two effects' signatures, what the model absorbs taken off."""
         a, b = list(one.hypothesis.columns), list(other.hypothesis.columns)
         g = self.gram.gram
-        left = np.linalg.cholesky(g[np.ix_(a, a)] + 1e-9 * np.eye(len(a)))
-        right = np.linalg.cholesky(g[np.ix_(b, b)] + 1e-9 * np.eye(len(b)))
+        try:
+            left = np.linalg.cholesky(g[np.ix_(a, a)] + 1e-9 * np.eye(len(a)))
+            right = np.linalg.cholesky(g[np.ix_(b, b)] + 1e-9 * np.eye(len(b)))
+        except np.linalg.LinAlgError:
+            # The model absorbs a signature down to its rounding: there is nothing to be alike.
+            return 0.0
         across = np.linalg.solve(left, np.linalg.solve(right, g[np.ix_(b, a)]).T)
         return float(min(1.0, np.linalg.svd(across, compute_uv=False)[0]))
 
@@ -389,7 +393,13 @@ def diagnose(
         hypotheses, table = signatures(loop, batch, linear, proposed, row, say)
         data = Data(residual, base, _at_samples(batch, table), np.asarray(batch.kept))
         say(f"scoring {len(hypotheses)} hypotheses")
-        return _judge(fit, data, hypotheses, scene, linear.motion, significance)
+        try:
+            return _judge(fit, data, hypotheses, scene, linear.motion, significance)
+        except np.linalg.LinAlgError as error:
+            raise FitError(
+                f"what is left of these recordings by {loop.name} is too large to be held against "
+                "anything: check the units of the recordings and the loop's gains"
+            ) from error
 
 
 def _as_fitted(fit: Fit | Comparison, loop: ClosedLoop) -> tuple[str, Batch, np.ndarray]:

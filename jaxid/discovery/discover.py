@@ -22,8 +22,8 @@ from ..archive import classes_of
 from ..campaign import Campaign
 from ..effects import AbstractEffect, AbstractTransmission, Curve
 from ..effects import catalogue as known
-from ..errors import ModelError
-from ..estimate import OEM, Fit, SeparablePEM, fit
+from ..errors import FitError, ModelError
+from ..estimate import OEM, Fit, SeparablePEM, Status, fit
 from ..loop import ClosedLoop
 from ..noise import ARFilter, fit_ar
 from ..parameters import Bounds, list_parameters, read_values, write_values
@@ -334,6 +334,11 @@ def discover(
             if step is not None:
                 steps.append(step)
         steps, removed = search.prune(steps, say)
+    if verdict != "outside_catalogue" and steps[-1].fit.status is Status.misfit:
+        raise FitError(
+            f"neither {loop.name} nor the catalogue explains anything of these recordings: "
+            f"{steps[-1].fit.notes[-1]}"
+        )
     notes = _notes(steps, most)
     return Discovery(verdict, tuple(steps), removed, notes, time.perf_counter() - started)
 

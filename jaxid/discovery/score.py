@@ -202,13 +202,22 @@ def chance(value: float, freedom: int) -> float:
     return float(scipy.stats.chi2.sf(value, freedom)) if freedom else 1.0
 
 
+def root_of(gram: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """A matrix R with R R' the given one, of which rounding may have left less than nothing."""
+    try:
+        return np.linalg.cholesky(gram)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(gram)
+        return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
 def effective_tests(gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0) -> float:
     """How many independent tests the blocks amount to, by drawing noise in their own space.
 
     The smallest p-value of correlated tests is distributed as that of fewer independent ones.
     """
     n = len(gram.gram)
-    root = np.linalg.cholesky(gram.gram + 1e-5 * np.eye(n))
+    root = root_of(gram.gram + 1e-5 * np.eye(n))
     noise = root @ np.random.default_rng(seed).standard_normal((n, draws))
     smallest = np.ones(draws)
     for _, columns in by_width(blocks):

@@ -239,6 +239,9 @@ def determined_covariance(
     - `names`: of its rows. `scales`: typical sizes of these parameters.
     - `meat`: covariance of the score where it is not `information`; gives the sandwich.
     """
+    if not (np.isfinite(information).all() and (meat is None or np.isfinite(meat).all())):
+        lost = "the signals' derivatives leave what float64 holds, so that no deviation is known"
+        return np.diag(np.full(len(names), np.inf)), (lost,)
     size = np.sqrt(np.maximum(np.diag(information), 0))
     # Ten thousand times a parameter's usual size without a trace in the signals: its column is
     # what rounding left of a motion that was not made.

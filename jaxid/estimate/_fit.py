@@ -34,7 +34,7 @@ def fit(
     method = OEM() if method is None else method
     if not isinstance(method, AbstractMethod):
         raise FitError(f"{method!r} is not a method: give an object such as jaxid.OEM()")
-    return _doubted(_honest(method.fit(loop, recordings)))
+    return _followed(_doubted(_honest(method.fit(loop, recordings))))
 
 
 def _honest(found: Fit) -> Fit:
@@ -65,7 +65,8 @@ def _doubted(found: Fit) -> Fit:
     It is no success where no signal is explained at all, or one is left larger than it was.
     """
     left = _left_percent(found)
-    if found.succeeded and (left.min() > 99.0 or left.max() > 105.0):
+    settled = found.status in (Status.converged, Status.stalled)
+    if settled and (left.min() > 99.0 or left.max() > 105.0):
         found = dataclasses.replace(found, status=Status.misfit)
     largest = found.error_percent.to_numpy().max(axis=0)
     errors = {str(c): float(x) for c, x in zip(found.error_percent.columns, largest, strict=True)}
@@ -77,6 +78,23 @@ def _doubted(found: Fit) -> Fit:
         f"the model does not describe these recordings ({joints} of the signal is left): check "
         "units, signs, the control law and its gains, and whether there is more motion than noise"
     )
+    return dataclasses.replace(found, notes=(*found.notes, note))
+
+
+def _followed(found: Fit) -> Fit:
+    """The fit, with the joints whose recorded position has little to do with its reference.
+
+    Simulations start from the reference, so that a torque may be explained whatever q says.
+    """
+    pairs = [(r.q - r.q_ref, r.q_ref) for r in found.recordings if r.q_ref is not None]
+    if not pairs:
+        return found
+    away, moved = (sum(np.var(x, axis=0) for x in both) for both in zip(*pairs, strict=True))
+    astray = np.flatnonzero((moved > 0) & (away > 0.8 * moved))
+    if not astray.size:
+        return found
+    joints = ", ".join(str(j + 1) for j in astray)
+    note = f"q does not follow q_ref on joint {joints}: check the units and signs of both"
     return dataclasses.replace(found, notes=(*found.notes, note))
 
 

@@ -1,5 +1,6 @@
 """DIDIM and IDIM-IV: regressions on the motion of the simulated loop."""
 
+import dataclasses
 import time
 
 import equinox as eqx
@@ -34,7 +35,10 @@ def _moved(
 ) -> tuple[ClosedLoop, Float[Array, ""]]:
     chosen = linear_parameters(loop)
     bounds = Bounds.of(chosen)
-    moved = write_values(loop, chosen, bounds.inside(bounds.outside(theta)))
+    within = (theta > bounds.lower) & (theta < bounds.upper)
+    # Those that are inside stay, however near: a small robot's values are all near zero.
+    values = jnp.where(within, theta, bounds.inside(bounds.outside(theta)))
+    moved = write_values(loop, chosen, values)
     return moved, moved.arm.smallest_inertia()
 
 
@@ -96,7 +100,11 @@ class _Iterated(AbstractMethod):
                 f"{type(self).__name__} cannot start: the loop diverges in simulation at its "
                 "initial values; start from the result of IDIM"
             )
-        return regression_fit(loop, recordings, self, stacked, solved, started, status, count)
+        found = regression_fit(loop, recordings, self, stacked, solved, started, status, count)
+        if found.status is not Status.misfit:
+            return found
+        note = "simulated at these values, the torque is further from the measured one than zero is"
+        return dataclasses.replace(found, notes=(*found.notes, note))
 
 
 class DIDIM(_Iterated):
