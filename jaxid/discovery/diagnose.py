@@ -374,6 +374,11 @@ def diagnose(
 
     **Raises:** `FitError` where the fitted loop cannot be simulated.
     """
+    if fit.error_percent.to_numpy().max() < 1e-8:
+        raise FitError(
+            f"{fit.loop.name} leaves nothing of these recordings but rounding: they were simulated "
+            "with it, and there is nothing to diagnose"
+        )
     with working(f"diagnosis of {fit.loop.name}", progress) as say:
         loop = with_substeps(fit.loop, fit.recordings)
         output, batch, free = _as_fitted(fit, loop)

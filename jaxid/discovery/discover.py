@@ -430,6 +430,9 @@ class _Search(eqx.Module):
         Steps of the encoders, of the integration, and what a smooth sign makes of a sharp one show
         as a thousandth of the effects themselves, which with large effects is no small matter.
         """
+        if steps[-1].fit.error_percent.to_numpy().max() < 1e-3:
+            # Recordings without noise: what is left is the integration's.
+            return lambda v: False
         noise = steps[-1].diagnosis.noise
         gone = _whitened_error(steps[0].fit.residuals, noise)
         gone -= _whitened_error(steps[-1].fit.residuals, noise)

@@ -90,7 +90,9 @@ def _followed(found: Fit) -> Fit:
     if not pairs:
         return found
     away, moved = (sum(np.var(x, axis=0) for x in both) for both in zip(*pairs, strict=True))
-    astray = np.flatnonzero((moved > 0) & (away > 0.8 * moved))
+    # A reference at rest has the spread of its rounding, and is not followed anywhere.
+    still = moved < 1e-20 * max(float(np.mean(ref**2)) for _, ref in pairs)
+    astray = np.flatnonzero(~still & (away > 0.8 * moved))
     if not astray.size:
         return found
     joints = ", ".join(str(j + 1) for j in astray)
