@@ -452,6 +452,40 @@ def parameters(
     return _finish(figure, title, height=130 + 30 * len(names), legend=True)
 
 
+def deviance(
+    values: Float[np.ndarray, " points"],
+    lost: Float[np.ndarray, " points"],
+    centre: float,
+    std: float,
+    name: str,
+    unit: str,
+    *,
+    title: str | None = None,
+) -> go.Figure:
+    """Draw a likelihood profile beside the parabola that its deviation promises.
+
+    Arguments:
+        values: At which the parameter was held, shape `(points,)`.
+        lost: Deviance there, shape `(points,)`.
+        centre: The estimate.
+        std: Its standard deviation.
+        name: Of the parameter.
+        unit: Of the parameter.
+        title: Of the whole figure.
+    """
+    figure = go.Figure()
+    x = np.linspace(min(values[0], centre - 3 * std), values[-1], 121)
+    line = {"color": ORANGE, "dash": "dash"}
+    parabola = ((x - centre) / std) ** 2
+    figure.add_scatter(x=x, y=parabola, name="as the deviation has it", mode="lines", line=line)
+    marker = {"color": BLUE, "size": 9}
+    figure.add_scatter(x=values, y=lost, name="profile", mode="markers", marker=marker)
+    figure.add_hline(y=3.84, line={"color": INK, "dash": "dot"}, annotation_text="95 %")
+    figure.update_xaxes(title_text=_with_unit(name, unit))
+    figure.update_yaxes(title_text="deviance", range=[0, 10])
+    return _finish(figure, title, height=360, legend=True)
+
+
 def ranking(
     labels: Sequence[str],
     explained: Float[np.ndarray, " candidates"],

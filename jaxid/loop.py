@@ -285,6 +285,18 @@ def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Fl
     return jnp.stack(x)
 
 
+class Outside(eqx.Module):
+    """What comes from outside the loop at one instant; vectors are `(joints,)`.
+
+    `push` is torque on the drives, `pull` on the links (the same where nothing gives way between
+    them), `noise` is added to what the sensors read.
+    """
+
+    push: Float[Array, " joints"]
+    pull: Float[Array, " joints"]
+    noise: Reading
+
+
 class Instant(eqx.Module):
     """Everything about one instant of the loop; vectors are `(joints,)`.
 
@@ -299,28 +311,48 @@ class Instant(eqx.Module):
     derivative: State
 
 
-def effect_load(
-    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...], curves: bool = True
-) -> Float[Array, " joints"]:
-    """Torque that all effects together ask for at a motion, `(joints,)`.
+def effect_loads(
+    loop: ClosedLoop,
+    motion: Motion,
+    states: tuple[Float[Array, " _"], ...],
+    links: Motion | None = None,
+    *,
+    curves: bool = True,
+    inertia: bool = True,
+) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
+    """Torque that all effects together ask of the drives, and that of the links, `(joints,)` each.
 
     Effects of the load come last, since they are given what the others leave of the torque.
-    `curves` is False to leave out what needs an acceleration that is not known yet.
+
+    **Arguments:**
+
+    - `motion`: of the drives. `states`: the effects' own. `links`: their motion, where they part
+      from the drives.
+    - `curves`: False to leave out what needs an acceleration that is not known yet.
+    - `inertia`: False to leave out what is proportional to acceleration.
     """
+    drive = link = jnp.zeros_like(motion.v)
+    behind = motion if links is None else links
     own = [
         (effect, state)
         for effect, state in zip(loop.effects, states, strict=True)
         if curves or not effect.needs_acceleration
     ]
-    total = jnp.zeros_like(motion.v)
-    for effect, state in own:
-        if not effect.loaded:
-            total = total + effect.torque(dataclasses.replace(motion, state=state))
-    left = dataclasses.replace(motion, tau=motion.tau - total)
     for effect, state in own:
         if effect.loaded:
-            total = total + effect.torque(dataclasses.replace(left, state=state))
-    return total
+            continue
+        seen = dataclasses.replace(behind if effect.on_link else motion, state=state)
+        if effect.inertial and not inertia:
+            seen = dataclasses.replace(seen, a=jnp.zeros_like(seen.a))
+        if effect.on_link:
+            link = link + effect.torque(seen)
+        else:
+            drive = drive + effect.torque(seen)
+    left = dataclasses.replace(motion, tau=motion.tau - drive)
+    for effect, state in own:
+        if effect.loaded:
+            drive = drive + effect.torque(dataclasses.replace(left, state=state))
+    return drive, link
 
 
 def inverse(
@@ -328,7 +360,7 @@ def inverse(
 ) -> Float[Array, " joints"]:
     """Torque at the joints that a motion takes (the inverse dynamic model), `(joints,)`."""
     rigid = loop.arm.mass_matrix(motion.q) @ motion.a + loop.arm.bias(motion.q, motion.v)
-    return rigid + effect_load(loop, motion, states)
+    return rigid + sum(effect_loads(loop, motion, states), jnp.zeros(()))
 
 
 def _added_inertia(
@@ -352,8 +384,7 @@ def instant(
     t: Float[Array, ""],
     state: State,
     reference: Reference,
-    push: Float[Array, " joints"],
-    noise: Reading,
+    outside: Outside,
     label: Int[Array, ""],
 ) -> Instant:
     """The closed loop at one instant: what is read, commanded and delivered, and what follows.
@@ -363,12 +394,11 @@ def instant(
     - `t`: time, s.
     - `state`: of the loop.
     - `reference`: what the controller is asked for.
-    - `push`: torque on the joints from outside, `(joints,)`, N·m or N.
-    - `noise`: added to what the sensors read.
+    - `outside`: what acts on it.
     - `label`: which recording.
     """
     seen = read(loop, state.q, state.v)
-    seen = Reading(seen.q + noise.q, seen.v + noise.v)
+    seen = Reading(seen.q + outside.noise.q, seen.v + outside.noise.v)
     mass = loop.arm.mass_matrix(state.q)
     command = loop.controller.command(seen, reference, state.controller, mass)
     tau = loop.controller.acting(command, state.controller)
@@ -379,7 +409,7 @@ def instant(
         arriving.append(motion.tau)
         seen_by = dataclasses.replace(motion, state=own)
         motion = dataclasses.replace(motion, tau=effect.command(seen_by))
-    a, twisting = _accelerations(loop, motion, state, push)
+    a, twisting = _accelerations(loop, motion, state, outside)
     rates = []
     for k, (effect, own) in enumerate(zip(loop.effects, state.effects, strict=True)):
         if k in twisting:
@@ -392,50 +422,60 @@ def instant(
 
 
 def _accelerations(
-    loop: ClosedLoop, motion: Motion, state: State, push: Float[Array, " joints"]
+    loop: ClosedLoop, motion: Motion, state: State, outside: Outside
 ) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
     """Accelerations of the drives, and of the twist of each transmission by its place."""
     added = _added_inertia(loop, motion, state.effects)
     matrix = loop.arm.mass_matrix(state.q) + added
     bias = loop.arm.bias(state.q, state.v)
+    own = state.effects
     if any(effect.needs_acceleration for effect in loop.effects):
-        without = motion.tau - effect_load(loop, motion, state.effects, curves=False) + push
+        drive, link = effect_loads(loop, motion, own, curves=False)
+        without = motion.tau - drive - link + outside.push + outside.pull
         motion = dataclasses.replace(motion, a=solve_positive(matrix, without - bias))
-    load = effect_load(loop, motion, state.effects)
-    # Inertia is on the left-hand side already.
-    available = motion.tau - load + added @ motion.a + push
     transmissions = [
         (k, e) for k, e in enumerate(loop.effects) if isinstance(e, AbstractTransmission)
     ]
-    if not transmissions:
-        return solve_positive(matrix, available - bias), {}
-    return _through_transmissions(loop, state, transmissions, available, added)
+    if transmissions:
+        return _through_transmissions(loop, motion, state, transmissions, outside, added)
+    # What is proportional to acceleration is on the left-hand side already.
+    drive, link = effect_loads(loop, motion, own, inertia=False)
+    torque = motion.tau - drive - link + outside.push + outside.pull
+    return solve_positive(matrix, torque - bias), {}
 
 
 def _through_transmissions(
     loop: ClosedLoop,
+    motion: Motion,
     state: State,
     transmissions: list[tuple[int, AbstractTransmission]],
-    available: Float[Array, " joints"],
+    outside: Outside,
     added: Float[Array, "joints joints"],
 ) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
     """Rotors on the drive's side, the rest of the inertia on the link's (Spong 1987)."""
-    q, v, on_link, rotors = state.q, state.v, available, jnp.zeros_like(state.q)
+    q, v = state.q, state.v
+    rotors = passed = jnp.zeros_like(q)
+    apart = jnp.zeros_like(q, bool)
     for k, transmission in transmissions:
         j, there = transmission.joint - 1, transmission.present()
         twist, rate = jnp.where(there, state.effects[k], 0.0)
         q, v = q.at[j].add(twist), v.at[j].add(rate)
-        passed = transmission.through(twist, rate)
-        on_link = on_link.at[j].set(jnp.where(there, passed, on_link[j]))
+        passed = passed.at[j].set(transmission.through(twist, rate))
+        apart = apart.at[j].set(there)
         rotors = rotors.at[j].set(jnp.where(there, transmission.rotor, 0.0))
+    links = dataclasses.replace(motion, q=q, v=v)
+    drive, held = effect_loads(loop, motion, state.effects, links, inertia=False)
+    available = motion.tau - drive + outside.push
+    on_link = jnp.where(apart, passed, available)
     matrix = loop.arm.mass_matrix(q) + added - jnp.diag(rotors)
-    link = solve_positive(matrix, on_link - loop.arm.bias(q, v))
+    reaching = on_link - held + outside.pull
+    link = solve_positive(matrix, reaching - loop.arm.bias(q, v))
     a, twisting = link, {}
     for k, transmission in transmissions:
         j, there = transmission.joint - 1, transmission.present()
-        drive = (available[j] - on_link[j]) / transmission.rotor
-        a = a.at[j].set(jnp.where(there, drive, link[j]))
-        twisting[k] = jnp.where(there, link[j] - drive, 0.0)
+        turned = (available[j] - on_link[j]) / transmission.rotor
+        a = a.at[j].set(jnp.where(there, turned, link[j]))
+        twisting[k] = jnp.where(there, link[j] - turned, 0.0)
     return a, twisting
 
 

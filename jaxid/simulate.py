@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .control import Reading, Reference
 from .errors import RecordingError
-from .loop import ClosedLoop, Instant, State, behind, instant, rest, settle
+from .loop import ClosedLoop, Instant, Outside, State, behind, instant, rest, settle
 from .recording import Recording, Recordings
 from .smoothing import Band
 from .stepping import RK4, flow
@@ -25,8 +25,8 @@ class Interval(eqx.Module):
     """What drives the loop from one grid point to the next; the last interval has no length.
 
     `reference` holds the coefficients of the interval's cubic, `torque` those of a line; `noise`
-    is added to what the sensors read and `push` to the torque at the joints, each given at both
-    ends and joined by a line, or None.
+    is added to what the sensors read, `push` and `pull` to the torque on drives and links, each
+    given at both ends and joined by a line, or None.
     """
 
     t0: Float[Array, ""]
@@ -37,6 +37,7 @@ class Interval(eqx.Module):
     torque: Float[Array, "2 joints"]
     noise: Float[Array, "2 joints"] | None = None
     push: Float[Array, "2 joints"] | None = None
+    pull: Float[Array, "2 joints"] | None = None
 
 
 class Batch(eqx.Module):
@@ -280,9 +281,12 @@ def _reference(interval: Interval, dt: Float[Array, ""]) -> Reference:
 
 def _instant_at(loop: ClosedLoop, interval: Interval, t: Float[Array, ""], state: State) -> Instant:
     dt = t - interval.t0
-    noise = _line(interval.noise, dt, interval.h, loop.joints)
-    push = _line(interval.push, dt, interval.h, loop.joints).q
-    return instant(loop, t, state, _reference(interval, dt), push, noise, interval.label)
+    noise, push, pull = (
+        _line(ends, dt, interval.h, loop.joints)
+        for ends in (interval.noise, interval.push, interval.pull)
+    )
+    outside = Outside(push.q, pull.q, noise)
+    return instant(loop, t, state, _reference(interval, dt), outside, interval.label)
 
 
 def unflatten(loop: ClosedLoop) -> Callable[[Float[Array, " states"]], State]:
@@ -524,7 +528,8 @@ def _slopes(loop: ClosedLoop, q: Float[Array, "points joints"]) -> Float[Array, 
     def rate(x, at):
         reference = Reference(at, zeros, zeros, zeros)
         state = unflatten(loop)(x)
-        now = instant(loop, jnp.zeros(()), state, reference, zeros, Reading(zeros, zeros), NOBODY)
+        outside = Outside(zeros, zeros, Reading(zeros, zeros))
+        now = instant(loop, jnp.zeros(()), state, reference, outside, NOBODY)
         return ravel_pytree(now.derivative)[0]
 
     return jax.vmap(lambda at: jax.jacfwd(rate)(ravel_pytree(rest(loop, at, zeros))[0], at))(q)

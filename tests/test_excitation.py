@@ -152,6 +152,7 @@ def test_result_shows_itself(found):
     assert list(found.table().index) == list(found.names)
     assert found.reference(periods=2).duration == pytest.approx(8.0)
     assert len(found.plot().data) >= 2
+    assert "left of the limits" in found._repr_html_()
 
 
 # --- what cannot be done is said ------------------------------------------------------------------

@@ -18,9 +18,14 @@ from jaxid.effects import (
     AbstractEffect,
     AbstractTransmission,
     ActuatorLag,
+    Backlash,
     Coulomb,
+    EndStop,
+    Gravity,
     JointElasticity,
     Motion,
+    Payload,
+    Spring,
     TimeDelay,
     TorqueOffset,
     Viscous,
@@ -268,6 +273,26 @@ def test_transmission_agrees_with_the_independent_one():
     theirs = independent_torque(fx.JointElasticity(2, 0.01, 0.02, damping=1e-3))
     np.testing.assert_allclose(run.tau, theirs, **SPLINE)
     assert np.abs(theirs - plain().tau).max() > 1e-2
+
+
+BASE = fx.Gravity(0.75, 0.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        (Spring(1, 2.0, 0.6), fx.Spring(1, 2.0, 0.3)),
+        (EndStop(1, 40.0, 0.2), fx.EndStop(1, 40.0, 0.2)),
+        (Gravity((0.0, 0.75 * 0.01), (3.0, 0.75 * 0.24)), BASE),
+        (Payload(0.5, 0.3), fx.Payload(0.5, 0.3)),
+    ],
+    ids=["spring", "end_stop", "gravity", "payload"],
+)
+def test_what_pulls_at_a_link_pulls_behind_its_transmission(ours, theirs):
+    """In the gap of a backlash the link is left to its load, and the drive feels none of it."""
+    gap, model = fx.Backlash(1, 0.01, 1.0, 4000.0), Backlash(1, 0.01, 1.0, 4000.0)
+    run = simulated(scara(model, ours, stepping=jaxid.Stepping(substeps=16)))
+    assert relative(run.tau, independent_torque(gap, theirs)).max() < 1e-3
 
 
 def test_absent_transmission_does_not_mind_another():

@@ -184,3 +184,36 @@ def test_hostile_files_and_columns_are_inert(
     assert window.page.locator("script:not([type])").count() == 2
     assert not Path("hit").exists()
     window.page.close()
+
+
+def test_it_is_read_and_printed_before_any_figure_is_drawn(browser: Any) -> None:
+    page = browser.new_page()
+    # A browser that never finds the time.
+    page.add_init_script("window.requestIdleCallback = () => 0")
+    page.goto(told().page.as_uri())
+    assert page.locator("h1").inner_text() == told().story.sentence
+    assert page.evaluate("typeof Plotly") == "undefined"
+    button = page.locator("table button").first
+    button.click()
+    assert page.locator("th[aria-sort]").count() == 1
+    assert not page.evaluate(DRAWN)
+    page.pdf(format="A4")
+    assert page.evaluate(DRAWN)
+    page.close()
+
+
+def test_figures_far_below_are_drawn_when_one_goes_there(browser: Any) -> None:
+    page = browser.new_page(viewport={"width": 1200, "height": 700})
+    # Time for one thing only: to begin to watch the window.
+    page.add_init_script(
+        "window.requestIdleCallback = (call) => {"
+        " if (!window.begun) { window.begun = true; setTimeout(call, 0); } return 0; }"
+    )
+    page.goto(told().page.as_uri())
+    last = page.locator("[data-figure]").last
+    page.locator("[data-figure][data-drawn]").first.wait_for()
+    assert last.get_attribute("data-drawn") is None
+    last.scroll_into_view_if_needed()
+    last.locator(".main-svg").first.wait_for()
+    assert not page.evaluate(DRAWN)
+    page.close()

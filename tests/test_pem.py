@@ -141,6 +141,9 @@ def test_bootstrap_spreads_as_the_deviations_say(fits):
     assert np.all((low < fits["sep"].theta) & (fits["sep"].theta < high))
     assert "bootstrap of 64 draws" in found.shown().deviations
     assert list(found.table().index) == list(fits["sep"].names)
+    assert list(found.table()["unit"]) == list(fits["sep"].units)
+    assert "64 draws, 64 settled" in found._repr_html_()
+    assert found.plot().layout.xaxis.title.text
 
 
 def test_profiles_are_parabolas_where_the_model_is_linear(fits):
@@ -151,6 +154,8 @@ def test_profiles_are_parabolas_where_the_model_is_linear(fits):
         low, high = (np.array(p.interval()) - fit.theta[k]) / fit.std[k]
         assert abs(low + 1.96) < 0.06
         assert abs(high - 1.96) < 0.06
+        assert fit.units[k] in p._repr_html_()
+        assert fit.units[k] in p.plot().layout.xaxis.title.text
     # Held elsewhere and fitted by the ordinary way, the error grows by what the profile says.
     p, k = found["Fc2"], fit.names.index("Fc2")
     held = fit.loop.hold(Fc2=float(p.values[0]))

@@ -127,16 +127,7 @@ class Diagnosis(AbstractShown):
 
     def correlation(self, one: Verdict, other: Verdict) -> float:
         """Largest correlation of two effects' signatures, what the model absorbs taken off."""
-        a, b = list(one.hypothesis.columns), list(other.hypothesis.columns)
-        g = self.gram.gram
-        try:
-            left = np.linalg.cholesky(g[np.ix_(a, a)] + 1e-9 * np.eye(len(a)))
-            right = np.linalg.cholesky(g[np.ix_(b, b)] + 1e-9 * np.eye(len(b)))
-        except np.linalg.LinAlgError:
-            # The model absorbs a signature down to its rounding: there is nothing to be alike.
-            return 0.0
-        across = np.linalg.solve(left, np.linalg.solve(right, g[np.ix_(b, a)]).T)
-        return float(min(1.0, np.linalg.svd(across, compute_uv=False)[0]))
+        return self.gram.correlation(one.hypothesis.columns, other.hypothesis.columns)
 
     def alike(self, verdict: Verdict, within: float = 10.0) -> tuple[Verdict, ...]:
         """Effects that these recordings can hardly tell apart from one.
@@ -269,6 +260,7 @@ class Diagnosis(AbstractShown):
         **Raises:** `SaveError` where it cannot be written.
         """
         return save(self, path)
+
     def _kept(self, rows: Float[np.ndarray, "recordings points"]) -> Float[np.ndarray, " samples"]:
         """The samples of all recordings, one after the other, of rows that may be finer."""
         mask = self.data.mask

@@ -328,11 +328,10 @@ def discover(
         steps = [campaign.piece("start", lambda: search.begin(loop, say))]
         verdict: Outcome | None = None
         while verdict is None:
-            verdict, step = campaign.piece(
+            verdict, more = campaign.piece(
                 f"turn {len(steps)}", lambda: search.turn(steps, most, say)
             )
-            if step is not None:
-                steps.append(step)
+            steps.extend(more)
         steps, removed = search.prune(steps, say)
     if verdict != "outside_catalogue" and steps[-1].fit.status is Status.misfit:
         raise FitError(
@@ -395,34 +394,72 @@ class _Search(eqx.Module):
 
     def turn(
         self, steps: list[Step], most: int, say: Callable[[str], None]
-    ) -> tuple[Outcome | None, Step | None]:
-        """One turn: a verdict, or the next step."""
+    ) -> tuple[Outcome | None, tuple[Step, ...]]:
+        """One turn: a verdict, or the next steps."""
         last = steps[-1]
         done = "explained" if last.added is not None else "adequate"
-        diagnosis = last.diagnosis
         matters = self.matters(steps)
-        entries = [v for v in diagnosis.ranking if matters(v) and v.possible and v.evidence > 0]
-        outside = any(map(matters, diagnosis.where))
+        outside = any(map(matters, last.diagnosis.where))
+        entries = _entries(last.diagnosis, matters)
         if len(steps) > most or not (entries or outside):
-            return "outside_catalogue" if outside else done, None
-        contenders = self.refit(last, _with_forms(_leading(entries), diagnosis.forms), say)
+            return "outside_catalogue" if outside else done, ()
+        contenders = self.contenders(last, entries, say)
         if outside and not self.convinces(contenders, last):
             contenders = self.second_thoughts(contenders, last, say)
-        if not self.convinces(contenders, last):
-            # A weak entry that no refit confirms is chance, unless a curve finds something as well.
-            outside = outside and self.confirmed(last, say)
-            return "outside_catalogue" if outside else done, None
-        best = contenders[0]
-        contenders[0] = best = self.settled(best, say)
+        if self.convinces(contenders, last):
+            return None, (self.grown(last, contenders, say),)
+        if outside and len(steps) < most and (further := self.detour(last, contenders, say)):
+            return None, further
+        # A weak entry that no refit confirms is chance, unless a curve finds something as well.
+        outside = outside and self.confirmed(last, say)
+        return "outside_catalogue" if outside else done, ()
+
+    def contenders(
+        self, last: Step, entries: Sequence[Verdict], say: Callable[[str], None]
+    ) -> list[Contender]:
+        """The leading entries, and other forms of them, refitted."""
+        return self.refit(last, _with_forms(_leading(entries), last.diagnosis.forms), say)
+
+    def grown(
+        self, last: Step, contenders: Sequence[Contender], say: Callable[[str], None]
+    ) -> Step:
+        """The next step, with the best contender in the model."""
+        best = self.settled(contenders[0], say)
         say(f"diagnosis with {_name(best.name, best.joint)}")
-        step = self.step(
+        return self.step(
             f"+ {_name(best.name, best.joint)}",
             best.fit,
             added=best.fit.loop.effects[-1],
-            alike=_alike(diagnosis, best, contenders),
-            contenders=tuple(contenders),
+            alike=_alike(last.diagnosis, best, contenders),
+            contenders=(best, *contenders[1:]),
         )
-        return None, step
+
+    def detour(
+        self,
+        start: Step,
+        contenders: Sequence[Contender],
+        say: Callable[[str], None],
+        longest: int = 2,
+    ) -> tuple[Step, ...]:
+        """Steps by which effects together do as well as the curve that none matches alone.
+
+        Screening sees each effect beside a model that lacks the other, and a curve may take a part
+        of both; a second effect shows its true size only when the first is in.
+        """
+        noise = start.diagnosis.noise
+        before = self.criterion(start.fit, noise)
+        steps = [start]
+        while contenders and len(steps) <= longest:
+            last = steps[-1]
+            if contenders[0].criterion >= self.criterion(last.fit, last.diagnosis.noise):
+                break
+            steps.append(self.grown(last, contenders, say))
+            gained = before - self.criterion(steps[-1].fit, noise)
+            if not _curve_is_better(start.diagnosis, gained):
+                return tuple(steps[1:])
+            left = _entries(steps[-1].diagnosis, self.matters([start, steps[-1]]))
+            contenders = self.contenders(steps[-1], left, say)
+        return ()
 
     def matters(self, steps: Sequence[Step]) -> Callable[[Verdict], bool]:
         """Whether something is significant, and more than what the steps so far leave of rounding.
@@ -606,6 +643,11 @@ def _transmissions(diagnosis: Diagnosis) -> list[Verdict]:
         for v in diagnosis.ranking
         if isinstance(v.hypothesis.effect, AbstractTransmission) and v.hypothesis.joint == joint
     ]
+
+
+def _entries(diagnosis: Diagnosis, matters: Callable[[Verdict], bool]) -> list[Verdict]:
+    """Entries of the ranking that matter and can be added."""
+    return [v for v in diagnosis.ranking if matters(v) and v.possible and v.evidence > 0]
 
 
 def _leading(entries: Sequence[Verdict]) -> list[Verdict]:

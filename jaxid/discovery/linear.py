@@ -8,17 +8,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..effects import Motion
+from ..effects import AbstractTransmission, Motion
 from ..loop import ClosedLoop
 from ..simulate import SIGNALS, Batch, Interval, advance, initial, run
+
+Place = Literal["push", "noise", "pull"]
 
 
 class Linearised(eqx.Module):
     """Exact derivatives of every interval along the runs of a batch.
 
-    With x' = A x + B u and y = C x + D u, where u holds the free parameters, then torque on the
-    joints at both ends of an interval, then what is added to the sensors at both ends. Each leaf
-    has `(recordings, points)` first. `motion` is the nominal one, `seen` the signals of `SIGNALS`.
+    With x' = A x + B u and y = C x + D u, where u holds the free parameters, then each of `places`
+    at both ends of an interval: torque on the drives (`push`), what is added to the sensors
+    (`noise`), and torque on the links (`pull`) where transmissions part them from the drives. Each
+    leaf has `(recordings, points)` first. `motion` is the nominal one, `seen` the signals of
+    `SIGNALS`.
     """
 
     A: Float[Array, "recordings points states states"]
@@ -28,6 +32,7 @@ class Linearised(eqx.Module):
     start: Float[Array, "recordings states starts"]
     motion: Motion
     seen: Float[Array, "recordings points 5 joints"]
+    places: tuple[Place, ...] = eqx.field(static=True)
 
 
 @eqx.filter_jit
@@ -40,11 +45,13 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     """
     n, theta, row = loop.joints, loop.theta, SIGNALS.index(output)
     p = theta.shape[0]
-    ends = jnp.zeros((4, n))
+    parted = any(isinstance(effect, AbstractTransmission) for effect in loop.effects)
+    places: tuple[Place, ...] = ("push", "noise", "pull") if parted else ("push", "noise")
+    ends = jnp.zeros((2 * len(places), n))
 
     def one(u, interval, x):
-        push, noise = u[p:].reshape(2, 2, n)
-        forced = dataclasses.replace(interval, push=push, noise=noise)
+        outside = dict(zip(places, u[p:].reshape(-1, 2, n), strict=True))
+        forced = dataclasses.replace(interval, **outside)
         after, seen = advance(loop.with_theta(u[:p]), forced, x)
         return jnp.concatenate([after, seen[row]])
 
@@ -73,7 +80,7 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
         )
         return a, b, c, d, start, motion, seen
 
-    return Linearised(*jax.vmap(whole)(batch.intervals, batch.q0, batch.v0))
+    return Linearised(*jax.vmap(whole)(batch.intervals, batch.q0, batch.v0), places)
 
 
 @eqx.filter_jit
@@ -105,19 +112,19 @@ def base_columns(
 @eqx.filter_jit
 def respond(
     linear: Linearised,
-    place: Literal["push", "noise"],
+    place: Place,
     values: Float[Array, "recordings points joints columns"],
 ) -> Float[Array, "recordings points outputs columns"]:
     """What inputs given at the points do to the output through the loop; linear in between.
 
     **Arguments:**
 
-    - `place`: `"push"` for torque on the joints, `"noise"` for what is added to the sensors.
+    - `place`: one of `linear.places`.
     - `values`: one column a hypothesis, N·m or N, rad or m.
     """
 
     joints, last = values.shape[2], linear.B.shape[-1]
-    first = last - {"push": 4, "noise": 2}[place] * joints
+    first = last - 2 * joints * (len(linear.places) - linear.places.index(place))
     inputs = slice(first, first + 2 * joints)
 
     def times(matrix, columns):

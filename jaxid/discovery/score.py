@@ -153,6 +153,15 @@ class Gram(eqx.Module):
             value[places], freedom[places] = found[0][:, 0], found[1]
         return value, freedom
 
+    def correlation(self, one: Sequence[int], other: Sequence[int]) -> float:
+        """Largest correlation of what two blocks span, 0 where one says nothing."""
+        whole = []
+        for columns in (list(one), list(other)):
+            values, vectors = _strong(self.gram[np.ix_(columns, columns)])
+            whole.append(vectors / np.sqrt(values))
+        across = whole[0].T @ self.gram[np.ix_(list(one), list(other))] @ whole[1]
+        return float(min(1.0, np.linalg.norm(across, 2))) if across.size else 0.0
+
     def amplitude(self, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Estimated amplitudes of a block, in its own units, and their covariance."""
         chosen = list(columns)
@@ -189,9 +198,17 @@ def explained_by(
 
 
 def _inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    values, vectors = _strong(matrix)
+    return (vectors / values) @ vectors.T
+
+
+def _strong(
+    matrix: Float[np.ndarray, "n n"],
+) -> tuple[Float[np.ndarray, " strong"], Float[np.ndarray, "n strong"]]:
+    """Eigenvalues and vectors of what the base has left enough of."""
     values, vectors = np.linalg.eigh(matrix)
     strong = values > WEAK
-    return (vectors[:, strong] / values[strong]) @ vectors[:, strong].T
+    return values[strong], vectors[:, strong]
 
 
 # --- p-values that count how many were asked ---------------------------------------------------
@@ -202,23 +219,13 @@ def chance(value: float, freedom: int) -> float:
     return float(scipy.stats.chi2.sf(value, freedom)) if freedom else 1.0
 
 
-def root_of(gram: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """A matrix R with R R' the given one, of which rounding may have left less than nothing."""
-    try:
-        return np.linalg.cholesky(gram)
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(gram)
-        return vectors * np.sqrt(np.maximum(values, 0.0))
-
-
 def effective_tests(gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0) -> float:
     """How many independent tests the blocks amount to, by drawing noise in their own space.
 
     The smallest p-value of correlated tests is distributed as that of fewer independent ones.
     """
     n = len(gram.gram)
-    root = root_of(gram.gram + 1e-5 * np.eye(n))
-    noise = root @ np.random.default_rng(seed).standard_normal((n, draws))
+    noise = _root(gram.gram) @ np.random.default_rng(seed).standard_normal((n, draws))
     smallest = np.ones(draws)
     for _, columns in by_width(blocks):
         inner = gram.gram[columns[:, :, None], columns[:, None, :]]
@@ -230,6 +237,16 @@ def effective_tests(gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0
     # there, so the number is that of independent tests with the same lowest tenth.
     lowest = float(np.quantile(smallest, 0.1))
     return max(1.0, float(np.log(0.9) / np.log1p(-lowest)))
+
+
+def _root(gram: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """A matrix whose product with its transpose is a Gram matrix, rounding aside."""
+    try:
+        return np.linalg.cholesky(gram + 1e-5 * np.eye(len(gram)))
+    except np.linalg.LinAlgError:
+        # Columns of single precision that nearly all point one way.
+        values, vectors = np.linalg.eigh(gram)
+        return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def corrected(p: float, tests: float) -> float:

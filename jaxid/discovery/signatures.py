@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..effects import AbstractEffect, AbstractTransmission, Coulomb, Curve, Motion, Scene
 from ..effects.curve import curve_over
 from ..errors import ModelError
-from ..loop import ClosedLoop, effect_load
+from ..loop import ClosedLoop, effect_loads
 from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..recording import Recordings
 from ..simulate import Batch, initial, run
@@ -194,11 +194,11 @@ def _forces(
 
 @eqx.filter_jit
 def _left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings points joints"]:
-    """Torque that the loop's own effects leave for the links along the runs."""
+    """Torque that the loop's own effects on the drives leave for the links along the runs."""
 
     def remaining(at: Motion):
         states = tuple(effect.initial_state() for effect in loop.effects)
-        return at.tau - effect_load(loop, at, states)
+        return at.tau - effect_loads(loop, at, states)[0]
 
     return jax.vmap(jax.vmap(remaining))(motion)
 
@@ -284,7 +284,6 @@ def signatures(
         reading = np.flatnonzero(np.asarray(jnp.any(noise != 0, axis=(0, 1, 2))))
         if len(reading):
             table[..., reading] += respond(linear, "noise", noise[..., reading])
-        blocks.append(table)
         for _, places in groups:
             low, high = _amplitude_bounds(proposed[direct[places[0]]][0])
             for place in places:
@@ -292,6 +291,10 @@ def signatures(
                 columns = tuple(range(at, at + len(low)))
                 made[direct[place]] = Hypothesis(effect, columns, low, high, tests)
                 at += len(low)
+        behind = [c for h in made.values() if h.effect.on_link for c in h.columns]
+        if "pull" in linear.places and behind:
+            table[..., behind] = respond(linear, "pull", push[..., np.array(behind)])
+        blocks.append(table)
     rest = [k for k in range(len(proposed)) if k not in made]
     for stacked, places in _grouped([proposed[k][0] for k in rest]):
         say(f"{stacked.effect_name()} by simulation")

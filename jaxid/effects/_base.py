@@ -18,8 +18,8 @@ class Motion(eqx.Module):
 
     `t` in s; `q`, `v`, `a` in rad or m and their derivatives; `tau` what the drives deliver, N·m
     or N. `a` is zero where an effect neither is `inertial` nor `needs_acceleration`. For an effect
-    that is `loaded`, `tau` is what the other effects leave for the links. `state` is the effect's
-    own. `label` tells recordings apart (`recording_label`).
+    that is `loaded`, `tau` is what the other effects on the drives leave for the links. `state` is
+    the effect's own. `label` tells recordings apart (`recording_label`).
     """
 
     t: Float[Array, ""]
@@ -43,11 +43,13 @@ class AbstractEffect(eqx.Module):
     - `needs_acceleration`: `torque` depends on acceleration in another way; it is given the
       acceleration that there would be without it.
     - `loaded`: `torque` depends on the torque that reaches the link.
+    - `on_link`: `torque` acts on the link, beyond what gives way between it and its drive.
     """
 
     inertial: ClassVar[bool] = False
     needs_acceleration: ClassVar[bool] = False
     loaded: ClassVar[bool] = False
+    on_link: ClassVar[bool] = False
 
     @classmethod
     def effect_name(cls) -> str:

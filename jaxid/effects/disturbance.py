@@ -18,6 +18,7 @@ class PeriodicDisturbance(AbstractEffect):
     A: Scalar = parameter(0.0, symbol="DA", unit="N·m", scale=0.1)
     B: Scalar = parameter(0.0, symbol="DB", unit="N·m", scale=0.1)
     frequency: Scalar = parameter(1.0, symbol="f", unit="Hz", lower=1e-3, scale=0.01, linear=False)
+    on_link = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["PeriodicDisturbance"]:

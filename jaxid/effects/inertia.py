@@ -45,6 +45,7 @@ class Payload(AbstractEffect):
     g: Scalar = eqx.field(converter=as_float64, default=0.0)
     slides: bool = eqx.field(static=True, default=False)
     inertial = True
+    on_link = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Payload"]:

@@ -56,6 +56,7 @@ class Spring(AbstractEffect):
     joint: int = eqx.field(static=True)
     stiffness: Scalar = parameter(0.0, symbol="k", unit="N·m/rad", scale=0.1)
     preload: Scalar = parameter(0.0, symbol="kq0_", unit="N·m", scale=0.1)
+    on_link = True
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """k q - k q0 on the joint, `(joints,)`."""
@@ -73,6 +74,7 @@ class EndStop(AbstractEffect):
     stiffness: Scalar = parameter(0.0, symbol="ke", unit="N·m/rad", lower=0.0, scale=1.0)
     angle: Scalar = parameter(0.0, symbol="qe", unit="rad", scale=0.1, linear=False)
     side: int = eqx.field(static=True, default=1)
+    on_link = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["EndStop"]:
@@ -99,6 +101,7 @@ class Gravity(AbstractEffect):
 
     G: Vector = parameter((0.0, 0.0), symbol="G", unit="N·m", scale=0.1)
     H: Vector = parameter((0.0, 0.0), symbol="H", unit="N·m", scale=0.1)
+    on_link = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Gravity"]:
@@ -127,6 +130,7 @@ class Tilt(AbstractEffect):
     gy: Scalar = parameter(0.0, symbol="gy", unit="m/s²", scale=0.1)
     first: Scalar | None = parameter(None, symbol="S1", unit="kg·m", scale=1.0, linear=False)
     moments: Float[Array, "joints 2"] = eqx.field(converter=as_float64, default=((0.0, 0.0),))
+    on_link = True
 
     @classmethod
     def effect_name(cls) -> str:

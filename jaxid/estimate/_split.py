@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ..effects import AbstractTransmission, Motion
 from ..errors import FitError
-from ..loop import ClosedLoop, effect_load
+from ..loop import ClosedLoop, effect_loads
 from ..parameters import Bounds, list_parameters, read_values, write_values
 from ..recording import Recording, Recordings
 from ..simulate import Simulated, recording_label
@@ -78,7 +78,7 @@ def split_torque(loop: ClosedLoop, at: Motion, once: bool) -> Float[Array, "4 sa
         first = split.first @ values
         if once:
             twice, first = jnp.zeros_like(twice), first + rate
-        zeroth = split.zeroth @ values + effect_load(loop, delivered, own)
+        zeroth = split.zeroth @ values + sum(effect_loads(loop, delivered, own), jnp.zeros(()))
         return jnp.stack([twice, first, zeroth, -delivered.tau])
 
     return jnp.moveaxis(jax.vmap(one)(at, states), 1, 0)

@@ -2,19 +2,21 @@
 
 import dataclasses
 
-import equinox as eqx
 import numpy as np
 import pandas as pd
+import plotly.graph_objects as go
 from jaxtyping import Bool, Float
 
+from .. import figures
 from ..errors import FitError
 from ..noise import ARFilter, VectorAR, fit_ar
+from ..showing import AbstractShown
 from ._base import Fit
 from .deviations import optimum_of
 from .refit import drawn_noise, redrawn, refit_signals
 
 
-class Bootstrap(eqx.Module):
+class Bootstrap(AbstractShown):
     """Estimates from recordings drawn anew, `(draws, parameters)`, beside the fit they belong to.
 
     `settled` says which draws ended within a tenth of a deviation of their minimum.
@@ -36,7 +38,7 @@ class Bootstrap(eqx.Module):
         return np.stack([2 * self.fit.theta - high, 2 * self.fit.theta - low], axis=1)
 
     def table(self, level: float = 0.95) -> pd.DataFrame:
-        """Value, bias, deviation and interval of each parameter."""
+        """Value, bias, deviation, interval and unit of each parameter."""
         low, high = self.interval(level).T
         return pd.DataFrame(
             {
@@ -45,6 +47,7 @@ class Bootstrap(eqx.Module):
                 "std": self.std,
                 "low": low,
                 "high": high,
+                "unit": list(self.fit.units),
             },
             index=pd.Index(self.fit.names, name="parameter"),
         )
@@ -55,9 +58,19 @@ class Bootstrap(eqx.Module):
         said = f"parametric bootstrap of {len(self.theta)} draws"
         return dataclasses.replace(self.fit, covariance=covariance, deviations=said)
 
+    def plot(self) -> go.Figure:
+        """The parameters with the deviations of the draws."""
+        names, units = list(self.fit.names), list(self.fit.units)
+        return figures.parameters(names, self.fit.theta, self.std, units)
+
     def __repr__(self) -> str:
-        head = f"{len(self.theta)} draws, {int(self.settled.sum())} settled"
-        return f"{head}\n{self.table().to_string(float_format=lambda x: f'{x:.4g}')}"
+        return f"{self._head()}\n{self.table().to_string(float_format=lambda x: f'{x:.4g}')}"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{self._head()}</p>{self.table().to_html(float_format=lambda x: f'{x:.4g}')}"
+
+    def _head(self) -> str:
+        return f"{len(self.theta)} draws, {int(self.settled.sum())} settled"
 
 
 def bootstrap(fit: Fit, draws: int = 200, *, seed: int = 0) -> Bootstrap:

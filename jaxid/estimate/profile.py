@@ -1,15 +1,19 @@
 """Likelihood profiles: how much the error grows when one parameter is held elsewhere."""
 
 import dataclasses
+import html
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+import plotly.graph_objects as go
 from jaxtyping import Float
 from scipy import interpolate, optimize, stats
 
+from .. import figures
 from ..errors import FitError
+from ..showing import AbstractShown
 from ._base import Fit
 from .deviations import Reduced, covariance_of, optimum_of
 from .refit import Lanes, refit
@@ -18,7 +22,7 @@ from .refit import Lanes, refit
 REACH = np.array([-4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0])
 
 
-class Profile(eqx.Module):
+class Profile(AbstractShown):
     """Deviance of one parameter: twice the likelihood lost when it is held at a value.
 
     `values` and `deviance` run along the profile; `others` are the other parameters there.
@@ -51,9 +55,28 @@ class Profile(eqx.Module):
             ends.append(float(found.root))
         return ends[0], ends[1]
 
+    @property
+    def unit(self) -> str:
+        """Unit of the parameter."""
+        return self.fit.units[self.fit.names.index(self.name)]
+
+    def plot(self) -> go.Figure:
+        """Deviance along the profile, and the parabola that the fit's deviation promises."""
+        k = self.fit.names.index(self.name)
+        centre, std = float(self.fit.theta[k]), float(self.fit.std[k])
+        return figures.deviance(self.values, self.deviance, centre, std, self.name, self.unit)
+
     def __repr__(self) -> str:
         low, high = self.interval()
-        return f"{self.name}: 95 % from {low:.4g} to {high:.4g} by likelihood profile"
+        return f"{self.name}: 95 % from {low:.4g} to {high:.4g} {self.unit} by likelihood profile"
+
+    def _repr_html_(self) -> str:
+        shares = (0.68, 0.95, 0.997)
+        rows = [self.interval(share) for share in shares]
+        table = pd.DataFrame(rows, index=[f"{100 * x:g} %" for x in shares])
+        table.columns = [f"{end} ({self.unit})" for end in ("low", "high")]
+        head = f"<p>{html.escape(self.name)}: intervals by likelihood profile</p>"
+        return head + table.to_html(float_format=lambda x: f"{x:.4g}")
 
 
 def profile(fit: Fit, *names: str) -> dict[str, Profile]:

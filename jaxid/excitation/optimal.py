@@ -1,5 +1,6 @@
 """References that determine the parameters best: Fourier series under limits."""
 
+import html
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -20,6 +21,7 @@ from ..fourier import FourierSeries, fourier_basis
 from ..loop import ClosedLoop
 from ..parameters import Bounds
 from ..recording import Recording, Recordings
+from ..showing import AbstractShown
 from ..simulate import fastest_rate, set_substeps
 from ._information import (
     Kind,
@@ -137,7 +139,7 @@ def _score_and_slope(design: Design, z: Float[Array, " numbers"]) -> tuple[Array
     return jax.value_and_grad(lambda at: design.settings.judge(_information(design, at)))(z)
 
 
-class Excitation(eqx.Module):
+class Excitation(AbstractShown):
     """A reference that determines the parameters, and how well it will.
 
     - `series`: the reference as a Fourier series; `reference()` samples it.
@@ -196,13 +198,26 @@ class Excitation(eqx.Module):
 
     def __repr__(self) -> str:
         lines = [
-            f"a reference of {self.series.period:g} s and {self.series.harmonics} harmonics for "
-            f"{self.loop.name}, by its {self.kind} information",
+            self._head(),
             self.table().to_string(float_format=lambda x: f"{x:.3g}"),
             "left of the limits, %:",
             self.margins.to_string(float_format=lambda x: f"{x:.1f}"),
         ]
         return "\n".join([*lines, *self.undetermined])
+
+    def _repr_html_(self) -> str:
+        foot = "".join(f"<p>{html.escape(s)}</p>" for s in self.undetermined)
+        return (
+            f"<p>{html.escape(self._head())}</p>"
+            f"{self.table().to_html(float_format=lambda x: f'{x:.3g}')}"
+            f"<p>left of the limits, %</p>{self.margins.to_html(float_format='%.1f')}{foot}"
+        )
+
+    def _head(self) -> str:
+        return (
+            f"a reference of {self.series.period:g} s and {self.series.harmonics} harmonics for "
+            f"{self.loop.name}, by its {self.kind} information"
+        )
 
 
 def _check(loop: ClosedLoop, limits: Limits, period: float, harmonics: int, rate: float) -> None:

@@ -49,9 +49,10 @@ def page(story: Discovery) -> str:
         tag("style", Markup(_part("page.css"))),
     )
     without = tag("noscript", tag("p", "The figures need JavaScript.", class_="note"))
-    # Last, so that the verdict is read while the browser still takes in the drawing library.
-    scripts = [tag("script", Markup(code)) for code in (get_plotlyjs(), _part("page.js"))]
-    content = tag("body", tag("main", without, body(story)), *scripts)
+    # Text of no language: the browser does not run it, the page's own script does when it draws.
+    library = tag("script", Markup(get_plotlyjs()), type="text/plain", data_library="")
+    script = tag("script", Markup(_part("page.js")))
+    content = tag("body", tag("main", without, body(story)), library, script)
     return f"<!doctype html>\n{tag('html', join(head, content), lang='en')}\n"
 
 

@@ -27,6 +27,15 @@ for (const table of document.querySelectorAll("table")) {
   });
 }
 
+// The drawing library lies in the page as text, which costs nothing to load, and is run once, for
+// the first figure that is drawn.
+function library() {
+  if (window.Plotly !== undefined) return;
+  const code = document.createElement("script");
+  code.textContent = document.querySelector("[data-library]").textContent;
+  document.head.append(code);
+}
+
 // A figure is drawn once it comes near the window, the others when the browser has nothing to do.
 const root = document.documentElement;
 const boxes = [...document.querySelectorAll("[data-figure]")];
@@ -37,6 +46,7 @@ const ink = () => ({ "font.color": colour("--quiet") });
 function draw(box) {
   if (box.dataset.drawn !== undefined) return;
   box.dataset.drawn = "";
+  library();
   const { data, layout } = JSON.parse(box.nextElementSibling.textContent);
   layout.font = { ...layout.font, color: colour("--quiet") };
   Plotly.newPlot(box, data, layout, config);
@@ -83,10 +93,8 @@ const seen = new IntersectionObserver(
   },
   { rootMargin: "300px" },
 );
-for (const box of boxes) {
-  seen.observe(box);
+for (const box of boxes)
   if (box.dataset.linked !== undefined) box.addEventListener("keydown", key);
-}
 const idle = window.requestIdleCallback ?? ((call) => setTimeout(call, 50));
 function drawOne() {
   const box = boxes.find((one) => one.dataset.drawn === undefined);
@@ -94,7 +102,13 @@ function drawOne() {
   draw(box);
   idle(drawOne);
 }
-addEventListener("load", () => idle(drawOne));
+// Not before the page has loaded and been shown: text, tables and links need no figure.
+addEventListener("load", () =>
+  idle(() => {
+    for (const box of boxes) seen.observe(box);
+    idle(drawOne);
+  }),
+);
 
 const drawn = () => boxes.filter((box) => box.layout !== undefined);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
