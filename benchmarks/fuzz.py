@@ -10,6 +10,7 @@ atheris is there; FOLDER keeps its corpus.
 
 import argparse
 import collections
+import faulthandler
 import gzip
 import hashlib
 import inspect
@@ -224,6 +225,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for counts and findings")
     parser.add_argument("--atheris", type=Path, metavar="FOLDER")
     given = parser.parse_args()
+    # A reader in C may end the process; its input then stays behind in the temporary folder.
+    faulthandler.enable()
     seconds = 2.0 if given.quick else given.seconds
     if given.atheris is not None:
         atheris_fuzz(given.atheris, seconds)

@@ -1,8 +1,14 @@
 """Identify robot arms from closed-loop recordings, and find the physical effect the model lacks."""
 
+import gc as _gc
 import os as _os
 
-import jax as _jax
+# JAX hangs a callback on the garbage collector, in which a Ctrl-C gets lost. Importing takes
+# seconds, and nothing of it is garbage.
+_collecting = _gc.isenabled()
+_gc.disable()
+
+import jax as _jax  # noqa: E402
 
 _jax.config.update("jax_enable_x64", True)
 # XLA's CPU runtime calls one kernel for each operation of a loop's body, which takes five times as
@@ -65,3 +71,9 @@ from .saved import load as load  # noqa: E402
 from .saved import save as save  # noqa: E402
 from .simulate import simulate as simulate  # noqa: E402
 from .stepping import Stepping as Stepping  # noqa: E402
+
+if _collecting:
+    # What was imported counts as old, so that no collection is due at once.
+    _gc.freeze()
+    _gc.unfreeze()
+    _gc.enable()

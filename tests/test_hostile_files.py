@@ -1,5 +1,6 @@
 """Recordings that were made to do harm: nothing is executed, and nothing unpacks without end."""
 
+import contextlib
 import gzip
 import io
 import os
@@ -135,6 +136,41 @@ def test_matlab_headers_that_lie(tmp_path: Path) -> None:
     packed = zlib.compress(inner)
     content = buffer.getvalue()[:128] + struct.pack("<II", 15, len(packed)) + packed
     refused(tmp_path / "run.mat", content)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_matlab_flags_that_lie(tmp_path: Path, compressed: bool) -> None:
+    # One of them, complex without an imaginary part, ended the process in SciPy's reader.
+    frame = {"time": 0.01 * np.arange(30), "q": np.sin(np.arange(30)), "tau": np.cos(np.arange(30))}
+    buffer = io.BytesIO()
+    scipy.io.savemat(buffer, frame)
+    plain = buffer.getvalue()
+    # The first variable: a reader that goes on behind it finds the next one.
+    end = 136 + struct.unpack_from("<I", plain, 132)[0]
+    for at in range(144, 152):
+        for value in {0, 1, 4, 14, 0x6E, 0xFF} - {plain[at]}:
+            content = bytearray(plain)
+            content[at] = value
+            if compressed:
+                packed = zlib.compress(bytes(content[128:end]))
+                content[128:end] = struct.pack("<II", 15, len(packed)) + packed
+            path = tmp_path / "run.mat"
+            path.write_bytes(bytes(content))
+            # Bits that mean nothing are let pass.
+            with contextlib.suppress(RecordingError):
+                assert read(path)[0].samples == 30
+
+
+def test_matlab_files_of_every_kind(tmp_path: Path) -> None:
+    time = 0.01 * np.arange(30)
+    signals = {"time": time, "q": np.sin(time)[:, None], "tau": np.round(9 * np.cos(9 * time))}
+    for number in ("f8", "f4", "i2"):
+        signals["tau"] = signals["tau"].astype(number)
+        for settings in ({"format": "4"}, {}, {"do_compression": True}):
+            scipy.io.savemat(tmp_path / "run.mat", signals, **settings)
+            found = read(tmp_path / "run.mat")[0]
+            np.testing.assert_array_equal(found.tau[:, 0], signals["tau"])
+            np.testing.assert_array_equal(found.q, signals["q"])
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with a name here")

@@ -10,6 +10,7 @@ import jaxid
 from jaxid.control import Cascade
 from jaxid.effects import AsymmetricFriction, TorqueOffset
 from jaxid.errors import FitError
+from jaxid.estimate.idim import Stacked, solve
 from jaxid.smoothing import low_pass, signal_cutoff
 
 # Janot, Gautier, Brunot 2019: value and standard deviation.
@@ -237,3 +238,21 @@ def test_two_offsets_on_one_joint_are_undetermined_along_their_difference(noisy)
     names = list(fit.names)
     assert np.isinf(fit.std[names.index("offset2")])
     assert np.isfinite(fit.std[names.index("ZZ2")])
+
+
+def test_instruments_are_unsure_of_what_they_do_not_see():
+    rng = np.random.default_rng(3)
+    columns = rng.normal(size=(300, 1, 3))
+    right = columns @ np.array([1.0, -2.0, 3.0]) + 0.1 * rng.normal(size=(300, 1))
+    stacked = Stacked(columns, right, np.ones(3), (300,))
+    tools = columns + 0.5 * rng.normal(size=columns.shape)
+    seen = solve(stacked, ("a", "b", "c"), "ordinary", tools)
+    # The textbook's (Z'W)^-1 Z'Z (W'Z)^-1.
+    cross = np.linalg.inv(tools[:, 0].T @ columns[:, 0])
+    variance = np.sum(seen.residual**2) / 297
+    textbook = variance * cross @ (tools[:, 0].T @ tools[:, 0]) @ cross.T
+    np.testing.assert_allclose(seen.covariance, textbook, rtol=1e-9)
+    tools[..., 2] = 0.0
+    blind = solve(stacked, ("a", "b", "c"), "ordinary", tools)
+    assert np.isinf(blind.covariance[2, 2])
+    assert len(blind.undetermined) == 1

@@ -2,10 +2,15 @@
 
 import shutil
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
-from test_discover_cli import told
+from test_discover_cli import DEMO, told
+from typer.testing import CliRunner
+
+from jaxid.cli import app
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
@@ -32,24 +37,32 @@ def browser() -> Iterator[Any]:
 
 
 class Opened:
-    """The demo's page in a window, and what the browser complained of or asked for."""
+    """A page, the demo's by default, and what the browser complained of or asked for."""
 
-    def __init__(self, browser: Any, width: int = 1200, scheme: str = "light") -> None:
+    def __init__(
+        self, browser: Any, width: int = 1200, scheme: str = "light", page: Path | None = None
+    ) -> None:
         self.page = browser.new_page(
             viewport={"width": width, "height": 900}, color_scheme=scheme
         )
         self.said: list[str] = []
         self.asked: list[str] = []
+        self.dialogs: list[str] = []
         self.page.on("console", lambda message: self.said.append(message.text))
         self.page.on("pageerror", lambda error: self.said.append(str(error)))
         self.page.on("request", lambda request: self.asked.append(request.url))
-        self.page.goto(told().page.as_uri())
+        self.page.on("dialog", self._dialog)
+        self.page.goto((page or told().page).as_uri())
         # The page forbids itself to evaluate text, which waiting for a function would do.
         for _ in range(600):
             if self.page.evaluate(DRAWN):
                 return
             self.page.wait_for_timeout(50)
         raise AssertionError("a figure was not drawn within 30 s")
+
+    def _dialog(self, dialog: Any) -> None:
+        self.dialogs.append(dialog.message)
+        dialog.dismiss()
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +148,42 @@ def test_it_prints_what_is_folded_away(opened: Opened) -> None:
     folded = "document.querySelectorAll('details:not(.raw):not([open])').length"
     assert opened.page.evaluate(folded) == 0
     assert opened.said == []
+
+
+HOSTILE = (
+    "<script>alert(1)<script>",
+    '"><img src=x onerror=alert(2)>',
+    "$(touch hit);`touch hit`&'",
+)
+BOLD = '<b>bold</b><a href="javascript:alert(3)">$(touch hit)</script>'
+
+
+def test_hostile_files_and_columns_are_inert(
+    browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The demo's clean set: of the size that is compiled already, and nothing to be found.
+    monkeypatch.chdir(tmp_path)
+    for name, own in zip(HOSTILE, ("fit_1", "fit_2", "held_out"), strict=True):
+        frame = pd.read_csv(DEMO / "clean" / f"{own}.csv")
+        frame.set_axis([f"{BOLD}{c}" for c in frame], axis=1).to_csv(f"{name}.csv", index=False)
+    files = [f"{name}.csv" for name in HOSTILE]
+    columns = ["time={}time", "q={0}q_1,{0}q_2", "tau={0}tau_1,{0}tau_2"]
+    columns += ["q_ref={0}q_ref_1,{0}q_ref_2"]
+    given = [word for c in columns for word in ("--column", c.format(BOLD))]
+    command = ["discover", *files[:2], "--validate", files[2], *given, "--report", "out.html"]
+    result = CliRunner().invoke(app, command, catch_exceptions=False)
+    assert result.exit_code == 0
+    window = Opened(browser, page=tmp_path / "out.html")
+    assert (window.said, window.dialogs) == ([], [])
+    assert window.asked == [(tmp_path / "out.html").as_uri()]
+    shown = window.page.evaluate("document.body.innerText")
+    assert all(name in shown for name in HOSTILE)
+    assert window.page.locator("img").count() == 0
+    assert window.page.locator("a[href^=javascript]").count() == 0
+    # The drawing library, the page's own script and figures' data are long.
+    assert window.page.evaluate("[...document.scripts].every((script) => script.text.length > 200)")
+    assert not Path("hit").exists()
+    window.page.close()
 
 
 def test_it_is_read_and_printed_before_any_figure_is_drawn(browser: Any) -> None:

@@ -366,6 +366,11 @@ def diagnose(
 
     **Raises:** `FitError` where the fitted loop cannot be simulated.
     """
+    if fit.error_percent.to_numpy().max() < 1e-8:
+        raise FitError(
+            f"{fit.loop.name} leaves nothing of these recordings but rounding: they were simulated "
+            "with it, and there is nothing to diagnose"
+        )
     with working(f"diagnosis of {fit.loop.name}", progress) as say:
         loop = with_substeps(fit.loop, fit.recordings)
         output, batch, free = _as_fitted(fit, loop)
@@ -385,7 +390,13 @@ def diagnose(
         hypotheses, table = signatures(loop, batch, linear, proposed, row, say)
         data = Data(residual, base, _at_samples(batch, table), np.asarray(batch.kept))
         say(f"scoring {len(hypotheses)} hypotheses")
-        return _judge(fit, data, hypotheses, scene, linear.motion, significance)
+        try:
+            return _judge(fit, data, hypotheses, scene, linear.motion, significance)
+        except np.linalg.LinAlgError as error:
+            raise FitError(
+                f"what is left of these recordings by {loop.name} is too large to be held against "
+                "anything: check the units of the recordings and the loop's gains"
+            ) from error
 
 
 def _as_fitted(fit: Fit | Comparison, loop: ClosedLoop) -> tuple[str, Batch, np.ndarray]:

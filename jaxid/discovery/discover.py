@@ -16,7 +16,8 @@ from ..archive import classes_of
 from ..campaign import Campaign
 from ..effects import AbstractEffect, AbstractTransmission
 from ..effects import catalogue as known
-from ..estimate import OEM, Fit, SeparablePEM, fit
+from ..errors import FitError
+from ..estimate import OEM, Fit, SeparablePEM, Status, fit
 from ..loop import ClosedLoop
 from ..noise import ARFilter, fit_ar
 from ..parameters import Bounds, list_parameters, read_values, write_values
@@ -79,6 +80,11 @@ def discover(
             )
             steps.extend(more)
         steps, removed = search.prune(steps, say)
+    if verdict != "outside_catalogue" and steps[-1].fit.status is Status.misfit:
+        raise FitError(
+            f"neither {loop.name} nor the catalogue explains anything of these recordings: "
+            f"{steps[-1].fit.notes[-1]}"
+        )
     notes = _notes(steps, most)
     return Discovery(verdict, tuple(steps), removed, notes, time.perf_counter() - started)
 
@@ -207,6 +213,9 @@ class _Search(eqx.Module):
         Steps of the encoders, of the integration, and what a smooth sign makes of a sharp one show
         as a thousandth of the effects themselves, which with large effects is no small matter.
         """
+        if steps[-1].fit.error_percent.to_numpy().max() < 1e-3:
+            # Recordings without noise: what is left is the integration's.
+            return lambda v: False
         noise = steps[-1].diagnosis.noise
         gone = _whitened_error(steps[0].fit.residuals, noise)
         gone -= _whitened_error(steps[-1].fit.residuals, noise)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..effects import AbstractEffect, AbstractTransmission, Coulomb, Curve, Motion, Scene
+from ..effects import AbstractEffect, Coulomb, Curve, Motion, Scene
 from ..effects.curve import curve_over
 from ..errors import ModelError
 from ..loop import ClosedLoop, effect_loads
@@ -270,9 +270,9 @@ def signatures(
     """Hypotheses and the table of their signatures, one column an amplitude.
 
     Effects that act at the joint, on the command or on the sensor: the response of the linear
-    system. Transmissions: the difference of a simulation with a small finite one.
+    system. Transmissions and limits: what a simulation with them differs by from the nominal one.
     """
-    direct = [k for k, (e, _) in enumerate(proposed) if not isinstance(e, AbstractTransmission)]
+    direct = [k for k, (effect, _) in enumerate(proposed) if not effect.finite]
     made: dict[int, Hypothesis] = {}
     blocks, at = [], 0
     groups = _grouped([proposed[k][0] for k in direct])

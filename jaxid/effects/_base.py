@@ -43,12 +43,15 @@ class AbstractEffect(eqx.Module):
     - `needs_acceleration`: `torque` depends on acceleration in another way; it is given the
       acceleration that there would be without it.
     - `loaded`: `torque` depends on the torque that reaches the link.
+    - `finite`: it has no derivative at nothing, or one that says little of what it does: screened
+      by simulations with it.
     - `on_link`: `torque` acts on the link, beyond what gives way between it and its drive.
     """
 
     inertial: ClassVar[bool] = False
     needs_acceleration: ClassVar[bool] = False
     loaded: ClassVar[bool] = False
+    finite: ClassVar[bool] = False
     on_link: ClassVar[bool] = False
 
     @classmethod
@@ -110,6 +113,7 @@ class AbstractTransmission(AbstractEffect):
 
     joint: eqx.AbstractVar[int]
     rotor: eqx.AbstractVar[Scalar]
+    finite = True
 
     def initial_state(self) -> Float[Array, " states"]:
         """No twist, at rest."""

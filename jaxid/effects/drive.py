@@ -111,6 +111,7 @@ class TorqueSaturation(AbstractEffect):
     limit: Scalar = parameter(
         jnp.inf, symbol="limit", unit="N·m", lower=0.0, scale=1.0, linear=False
     )
+    finite = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["TorqueSaturation"]:

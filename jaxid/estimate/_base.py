@@ -31,6 +31,8 @@ class Status(enum.Enum):
     max_seconds = "reached its limit of time; raise max_seconds"
     diverged = "no parameter values were found at which the loop can be simulated"
     overflowed = "its numbers leave what float64 holds; check the units of the recordings"
+    unphysical = "ended at values that no robot has: the mass matrix is not positive definite"
+    misfit = "describes the recordings no better than no model would"
 
 
 class Fit(AbstractShown):
@@ -237,9 +239,9 @@ def determined_covariance(
     - `names`: of its rows. `scales`: typical sizes of these parameters.
     - `meat`: covariance of the score where it is not `information`; gives the sandwich.
     """
-    if not np.isfinite(information).all():
-        sentence = "the simulated signals have no finite derivatives at these values"
-        return np.full_like(information, np.inf), (sentence,)
+    if not (np.isfinite(information).all() and (meat is None or np.isfinite(meat).all())):
+        lost = "the signals' derivatives leave what float64 holds, so that no deviation is known"
+        return np.diag(np.full(len(names), np.inf)), (lost,)
     size = np.sqrt(np.maximum(np.diag(information), 0))
     # Ten thousand times a parameter's usual size without a trace in the signals: its column is
     # what rounding left of a motion that was not made.

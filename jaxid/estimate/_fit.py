@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
+from jaxtyping import Float
 
 from ..errors import FitError
 from ..loop import ClosedLoop
@@ -33,7 +34,7 @@ def fit(
     method = OEM() if method is None else method
     if not isinstance(method, AbstractMethod):
         raise FitError(f"{method!r} is not a method: give an object such as jaxid.OEM()")
-    return _doubted(_honest(method.fit(loop, recordings)))
+    return _followed(_doubted(_honest(method.fit(loop, recordings))))
 
 
 def _honest(found: Fit) -> Fit:
@@ -59,7 +60,14 @@ _DOUBTFUL_PERCENT = 30.0
 
 
 def _doubted(found: Fit) -> Fit:
-    """The fit, with what to look at where it leaves more of a signal than a model should."""
+    """The fit, with what to look at where it leaves more of a signal than a model should.
+
+    It is no success where no signal is explained at all, or one is left larger than it was.
+    """
+    left = _left_percent(found)
+    settled = found.status in (Status.converged, Status.stalled)
+    if settled and (left.min() > 99.0 or left.max() > 105.0):
+        found = dataclasses.replace(found, status=Status.misfit)
     largest = found.error_percent.to_numpy().max(axis=0)
     errors = {str(c): float(x) for c, x in zip(found.error_percent.columns, largest, strict=True)}
     worst = {label: value for label, value in errors.items() if value > _DOUBTFUL_PERCENT}
@@ -71,3 +79,32 @@ def _doubted(found: Fit) -> Fit:
         "units, signs, the control law and its gains, and whether there is more motion than noise"
     )
     return dataclasses.replace(found, notes=(*found.notes, note))
+
+
+def _followed(found: Fit) -> Fit:
+    """The fit, with the joints whose recorded position has little to do with its reference.
+
+    Simulations start from the reference, so that a torque may be explained whatever q says.
+    """
+    pairs = [(r.q - r.q_ref, r.q_ref) for r in found.recordings if r.q_ref is not None]
+    if not pairs:
+        return found
+    away, moved = (sum(np.var(x, axis=0) for x in both) for both in zip(*pairs, strict=True))
+    # A reference at rest has the spread of its rounding, and is not followed anywhere.
+    still = moved < 1e-20 * max(float(np.mean(ref**2)) for _, ref in pairs)
+    astray = np.flatnonzero(~still & (away > 0.8 * moved))
+    if not astray.size:
+        return found
+    joints = ", ".join(str(j + 1) for j in astray)
+    note = f"q does not follow q_ref on joint {joints}: check the units and signs of both"
+    return dataclasses.replace(found, notes=(*found.notes, note))
+
+
+def _left_percent(found: Fit) -> Float[np.ndarray, " joints"]:
+    """Relative error of each joint over all recordings; of a signal that is nil there is none."""
+    errors = found.error_percent.to_numpy()
+    left = np.array([np.linalg.norm(r, axis=0) for r in found.residuals])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = np.where(errors > 0, left / errors, 0.0)
+        total = np.linalg.norm(left, axis=0) / np.linalg.norm(size, axis=0)
+    return np.where(np.isfinite(total), total, 0.0)

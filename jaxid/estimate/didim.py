@@ -1,5 +1,6 @@
 """DIDIM and IDIM-IV: regressions on the motion of the simulated loop."""
 
+import dataclasses
 import time
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from ..errors import FitError
 from ..loop import ClosedLoop
 from ..parameters import Bounds, write_values
 from ..recording import Recordings
-from ..simulate import Simulated, simulate
+from ..simulate import Simulated, compared, simulate
 from ._base import AbstractMethod, Fit, Status
 from ._regression import Filtering, linear_parameters
 from .idim import Solved, Stacked, Weights, regression_fit, solve, stack
@@ -34,7 +35,10 @@ def _moved(
 ) -> tuple[ClosedLoop, Float[Array, ""]]:
     chosen = linear_parameters(loop)
     bounds = Bounds.of(chosen)
-    moved = write_values(loop, chosen, bounds.inside(bounds.outside(theta)))
+    within = (theta > bounds.lower) & (theta < bounds.upper)
+    # Those that are inside stay, however near: a small robot's values are all near zero.
+    values = jnp.where(within, theta, bounds.inside(bounds.outside(theta)))
+    moved = write_values(loop, chosen, values)
     return moved, moved.arm.smallest_inertia()
 
 
@@ -44,6 +48,15 @@ def _explaining(recordings: Recordings, runs: tuple[Simulated, ...]) -> list[Sim
         eqx.tree_at(lambda s: s.tau, run, recording.tau)
         for run, recording in zip(runs, recordings, strict=True)
     ]
+
+
+def _explained(loop: ClosedLoop, recordings: Recordings, runs: tuple[Simulated, ...]) -> bool:
+    """Whether no joint's simulated torque is further from the measured one than zero would be."""
+    measured = compared(loop, recordings, [r.tau for r in recordings])
+    simulated = compared(loop, recordings, [np.asarray(run.tau) for run in runs])
+    pairs = list(zip(measured, simulated, strict=True))
+    left = sum(np.sum((m - s) ** 2, axis=0) for m, s in pairs)
+    return bool(np.all(left <= 1.05**2 * sum(np.sum(m**2, axis=0) for m, _ in pairs)))
 
 
 class _Iterated(AbstractMethod):
@@ -70,10 +83,16 @@ class _Iterated(AbstractMethod):
                 status = Status.diverged
                 break
             stacked, solved = self.solve_once(loop, recordings, _explaining(recordings, runs))
-            loop = physical(loop, solved.theta)
+            moved = physical(loop, solved.theta)
+            if moved is loop:
+                # Another regression on the same motion would give the same, and look settled.
+                status = Status.unphysical
+                break
+            loop = moved
             change = np.inf if before is None else np.abs(solved.theta - before)
             if np.all(change <= self.tolerance * np.abs(solved.theta)):
-                status = Status.converged
+                settled = _explained(loop, recordings, runs)
+                status = Status.converged if settled else Status.misfit
                 break
             before = solved.theta
         if stacked is None or solved is None:
@@ -81,7 +100,11 @@ class _Iterated(AbstractMethod):
                 f"{type(self).__name__} cannot start: the loop diverges in simulation at its "
                 "initial values; start from the result of IDIM"
             )
-        return regression_fit(loop, recordings, self, stacked, solved, started, status, count)
+        found = regression_fit(loop, recordings, self, stacked, solved, started, status, count)
+        if found.status is not Status.misfit:
+            return found
+        note = "simulated at these values, the torque is further from the measured one than zero is"
+        return dataclasses.replace(found, notes=(*found.notes, note))
 
 
 class DIDIM(_Iterated):

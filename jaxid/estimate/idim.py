@@ -86,8 +86,7 @@ def solve(
         wide = (weight[..., None] * stacked.columns).reshape(-1, p)
         right = (weight * stacked.right).reshape(-1)
         tools = (weight[..., None] * left).reshape(-1, p)
-        scale = np.linalg.norm(wide, axis=0)
-        scale[scale == 0] = 1.0
+        scale = _lengths(wide)
         gram = (tools / scale).T @ (wide / scale)
         theta = np.linalg.lstsq(gram, (tools / scale).T @ right, rcond=1e-12)[0] / scale
         residual = stacked.right - stacked.columns @ theta
@@ -103,14 +102,19 @@ def solve(
             weight *= np.sqrt(np.minimum(1.0, 1.345 / np.maximum(large, 1e-12)))
     count = stacked.right.shape[0] - p / joints
     variance = sigma**2 * stacked.right.shape[0] / count
+    if instruments is not None:
+        # What instruments do not share with the columns they say nothing of.
+        basis, size, _ = np.linalg.svd(tools / _lengths(tools), full_matrices=False)
+        wide = basis[:, size > 1e-11 * size[0]].T @ wide
     information = wide.T @ wide / variance
-    if instruments is None:
-        covariance, lost = determined_covariance(information, names, stacked.scales)
-    else:
-        cross = np.linalg.pinv(tools.T @ wide)
-        _, lost = determined_covariance(information, names, stacked.scales)
-        covariance = variance * cross @ (tools.T @ tools) @ cross.T
+    covariance, lost = determined_covariance(information, names, stacked.scales)
     return Solved(theta, covariance, residual, lost)
+
+
+def _lengths(columns: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, " parameters"]:
+    """Of columns; one for those that are nil."""
+    size = np.linalg.norm(columns, axis=0)
+    return np.where(size > 0, size, 1.0)
 
 
 def regression_fit(
@@ -133,6 +137,7 @@ def regression_fit(
         notes.append(f"{', '.join(shaped)} stayed as given: torque is not linear in them")
     if float(_smallest_inertia(fitted.arm)) <= 0:
         notes.append("these values are not physical: the mass matrix is not positive definite")
+        status = Status.unphysical if status is Status.converged else status
     measured = stacked.split(stacked.right)
     residuals = stacked.split(solved.residual)
     return Fit(

@@ -268,7 +268,7 @@ def _converge(
     signals = _signals(method, loop)
     batch = prepare(loop, pieces)
     free = jnp.asarray(_free_starts(method, pieces, batch))
-    weights = jnp.asarray(_first_weights(loop, pieces, signals))
+    first = weights = jnp.asarray(_first_weights(loop, pieces, signals))
     bounds = Bounds.of(loop.free_parameters)
     start = jnp.asarray(np.concatenate([batch.q0, batch.v0], axis=1))
     total, minimum, problem = 0, None, None
@@ -288,8 +288,12 @@ def _converge(
         if minimum.status is Status.diverged:
             break
         loop, start = loop.with_theta(minimum.point.theta), minimum.point.start
-        new = _new_weights(minimum.point.found, batch, weights)
+        new = _new_weights(minimum.point.found, batch, weights, first)
         # Estimates are flat in the weights: those that are a tenth off cost half a percent.
+        floor = bool(np.all(np.asarray(new) > 0.99 / _FLOOR * np.asarray(first)))
+        if minimum.status is Status.stalled and floor:
+            # Only rounding is left, in which no step finds less.
+            minimum = dataclasses.replace(minimum, status=Status.converged)
         settled = bool(np.all(np.abs(np.asarray(new) / np.asarray(weights) - 1) < 0.1))
         if (settled and worth < 1e-2) or total >= method.max_steps:
             break
@@ -322,13 +326,23 @@ def _mix(filters: Noise, weights: Float[Array, " outputs"]) -> Float[Array, "...
     return jnp.asarray(np.linalg.inv(root))
 
 
+# Share of a tenth of a signal below which its residual is rounding.
+_FLOOR = 1e-10
+
+
 def _new_weights(
-    found: Sensitivity, batch: Batch, weights: Float[Array, " outputs"]
+    found: Sensitivity,
+    batch: Batch,
+    weights: Float[Array, " outputs"],
+    first: Float[Array, " outputs"],
 ) -> Float[Array, " outputs"]:
-    """One over each output's residual deviation; recorded noise-free outputs keep a floor."""
+    """One over each output's residual deviation; recorded noise-free outputs keep a floor.
+
+    The floor is of the signal's size: one of the present weights would rise from round to round.
+    """
     residual, now = np.asarray(found.residual), np.asarray(weights)
     spread = np.sqrt(np.sum(residual**2, axis=(0, 1)) / np.sum(np.asarray(batch.kept))) / now
-    return jnp.asarray(1 / np.maximum(spread, 1e-9 / now))
+    return jnp.asarray(1 / np.maximum(spread, _FLOOR / np.asarray(first)))
 
 
 def _too_coarse(done: _Done, recordings: Recordings) -> int | None:
@@ -418,6 +432,6 @@ def _at_bounds(loop: ClosedLoop) -> list[str]:
     for p in loop.free_parameters:
         value = np.ravel(np.asarray(p.where(loop)))
         for bound, word in ((p.declaration.lower, "lower"), (p.declaration.upper, "upper")):
-            if np.isfinite(bound) and np.any(np.abs(value - bound) < 2e-3 * p.declaration.scale):
+            if np.isfinite(bound) and np.any(np.abs(value - bound) < 1e-9 * p.declaration.scale):
                 notes.append(f"{p.name} is at its {word} bound, {bound:g} {loop.unit(p)}")
     return notes

@@ -5,9 +5,7 @@ import gzip
 import io
 import itertools
 import os
-import struct
 import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -19,6 +17,7 @@ from ..archive import npy
 from ..errors import JaxidError, RecordingError, require
 from ._checks import Gaps, is_number
 from ._columns import Columns, Table, from_frame, pick, unique
+from ._matlab import order_of, variables
 from ._problem import brief, problem
 from ._recording import Recording, Recordings, build
 from ._units import Units
@@ -239,42 +238,29 @@ def _mat(source: str, data: bytes, largest: int) -> Table:
             "is a MATLAB file of version 7.3 (HDF5)",
             "save it again in MATLAB with save(file, '-v7')",
         )
-    _check_unpacked(source, data, largest)
-    listed = scipy.io.whosmat(io.BytesIO(data))
-    unique(source, [name for name, _, _ in listed])
-    odd = ("cell", "struct", "object", "function", "opaque", "sparse", "unknown")
-    refused = {name: f"{kind} variable" for name, _, kind in listed if kind in odd}
-    names = [name for name, _, _ in listed if name not in refused]
-    # An empty list of names would mean all of them.
-    loaded = scipy.io.loadmat(io.BytesIO(data), variable_names=names) if names else {}
+    order = order_of(data)
+    if order is None:
+        listed = _version_4(data)
+    else:
+        listed = list(variables(data, order, largest, lambda n: _too_large(source, n, largest)))
+    unique(source, [name for name, _ in listed])
+    refused = {name: f"{kind} variable" for name, kind in listed if isinstance(kind, str)}
     # MATLAB has no 1-d arrays: a vector comes as one row or one column.
     return Table(
-        {name: x.ravel() if 1 in x.shape else x for name in names for x in [loaded[name]]}, refused
+        {n: x.ravel() if 1 in x.shape else x for n, x in listed if not isinstance(x, str)}, refused
     )
 
 
-def _check_unpacked(source: str, data: bytes, largest: int) -> None:
-    """Refuses a MATLAB file whose compressed variables unpack to more than is read.
-
-    A variable is a tag of type and length, then its bytes; 15 is for zlib (MATLAB's MAT-File
-    Format, version 5).
-    """
-    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
-    if order is None:
-        # Version 4 knows no compression.
-        return
-    at, left = 128, largest
-    while at + 8 <= len(data):
-        kind, size = struct.unpack_from(f"{order}II", data, at)
-        if kind == 15:
-            unpacker = zlib.decompressobj()
-            packed = data[at + 8 : at + 8 + size]
-            while packed and not unpacker.eof:
-                left -= len(unpacker.decompress(packed, 2**20))
-                if left < 0:
-                    raise _too_large(source, largest - left, largest)
-                packed = unpacker.unconsumed_tail
-        at += 8 + size
+def _version_4(data: bytes) -> list[tuple[str, np.ndarray | str]]:
+    """Variables of a MATLAB file of version 4, which knows no compression."""
+    # Anything else SciPy would take for version 5, and read with less care than `variables`.
+    if 0 not in data[:4]:
+        raise ValueError("it is of neither version 4 nor version 5")
+    listed = scipy.io.whosmat(io.BytesIO(data))
+    names = [name for name, _, kind in listed if kind != "sparse"]
+    # An empty list of names would mean all of them.
+    loaded = scipy.io.loadmat(io.BytesIO(data), variable_names=names) if names else {}
+    return [(name, "sparse" if kind == "sparse" else loaded[name]) for name, _, kind in listed]
 
 
 def _npz(source: str, data: bytes, largest: int) -> Table:
