@@ -25,6 +25,7 @@ test: .venv/.installed-dev
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check jaxid tests benchmarks
 
 types: .venv/.installed-dev
 	$(BIN)/pyright --pythonpath $(BIN)/python

@@ -60,9 +60,7 @@ def pairs(robot: Robot) -> list[jaxid.Recordings]:
         for name in FITTING:
             r = case.recordings[name]
             tau = r["tau_true"] + noise.samples(r["tau_true"], rng)
-            signals.append(
-                jaxid.Recording(r["time"], r["q"], tau, q_ref=r["q_ref"], name=name)
-            )
+            signals.append(jaxid.Recording(r["time"], r["q"], tau, q_ref=r["q_ref"], name=name))
         made.append(jaxid.Recordings.of(signals))
     return made
 

@@ -34,9 +34,7 @@ def recorded() -> jaxid.Recordings:
     made = []
     for name in FITTING:
         r = case.recordings[name]
-        made.append(
-            jaxid.Recording(r["time"], r["q"], r["tau"], q_ref=r["q_ref"], name=name)
-        )
+        made.append(jaxid.Recording(r["time"], r["q"], r["tau"], q_ref=r["q_ref"], name=name))
     return jaxid.Recordings.of(made)
 
 

@@ -172,9 +172,7 @@ class ClosedLoop(eqx.Module):
 
     def _repr_html_(self) -> str:
         rows = "".join(
-            "<tr>"
-            + "".join(f"<td>{html.escape(cell)}</td>" for cell in _row(self, p))
-            + "</tr>"
+            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in _row(self, p)) + "</tr>"
             for p in self.parameters
         )
         head = "".join(f"<th>{name}</th>" for name in ("parameter", "value", "unit", "bounds", ""))

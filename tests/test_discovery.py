@@ -1,6 +1,5 @@
 """What is missing is found, on recordings of a simulator that shares no code with jaxid."""
 
-
 import equinox as eqx
 import independent as sim
 import jax.numpy as jnp

@@ -66,9 +66,7 @@ def test_burg_finds_the_filter_within_its_deviations_over_recordings(samples):
     ]
     # Cramér and Rao: variance · inverse autocovariance matrix / samples.
     lags = np.fft.ifft(spectrum_of(FOURTH, 4096)).real[:4]
-    bound = np.sqrt(
-        np.diag(np.linalg.inv(linalg.toeplitz(lags))) * FOURTH.variance / (3 * samples)
-    )
+    bound = np.sqrt(np.diag(np.linalg.inv(linalg.toeplitz(lags))) * FOURTH.variance / (3 * samples))
     ratio = np.std(estimates, axis=0) / bound
     assert np.all((ratio > 0.75) & (ratio < 1.3))
     bias = (np.mean(estimates, axis=0) - FOURTH.coefficients) / bound

@@ -42,9 +42,7 @@ class Opened:
     def __init__(
         self, browser: Any, width: int = 1200, scheme: str = "light", page: Path | None = None
     ) -> None:
-        self.page = browser.new_page(
-            viewport={"width": width, "height": 900}, color_scheme=scheme
-        )
+        self.page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
         self.said: list[str] = []
         self.asked: list[str] = []
         self.dialogs: list[str] = []

@@ -57,9 +57,7 @@ def columns_of(blocks: Blocks, chosen: Sequence[int]) -> list[int]:
     return [c for k in chosen for c in blocks[k]]
 
 
-def noise_of(
-    data: Data, rows: Rows, lost: float, highest: int = 30
-) -> tuple[ARFilter, ...]:
+def noise_of(data: Data, rows: Rows, lost: float, highest: int = 30) -> tuple[ARFilter, ...]:
     """One AR filter an output, its variance corrected for the freedom the model has taken.
 
     **Arguments:**

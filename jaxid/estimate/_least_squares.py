@@ -284,11 +284,7 @@ class Problem(eqx.Module):
         def part(loop: ClosedLoop, batch: Batch) -> Sensitivity:
             return unfiltered(loop, batch, self.weights, self.signals, self.free_start)
 
-        plain = (
-            part(loop, batch)
-            if self.mesh is None
-            else shared_out(part, self.mesh, loop, batch)
-        )
+        plain = part(loop, batch) if self.mesh is None else shared_out(part, self.mesh, loop, batch)
         return self.whitened(plain, extra)
 
     def whitened(self, plain: Sensitivity, extra: Float[Array, " _"]) -> Sensitivity:

@@ -220,6 +220,4 @@ def with_deviations(fit: Fit, kind: Deviations) -> Fit:
     """
     optimum = optimum_of(fit, "deviations of that kind")
     covariance, lost = covariance_of(optimum, kind, fit.noise)
-    return dataclasses.replace(
-        fit, covariance=covariance, undetermined=lost, deviations=SAID[kind]
-    )
+    return dataclasses.replace(fit, covariance=covariance, undetermined=lost, deviations=SAID[kind])

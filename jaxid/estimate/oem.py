@@ -281,9 +281,7 @@ def _converge(
         mix = _mix(filters, weights)
         problem = Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix)
         left = method.max_steps - total
-        minimum = minimise(
-            problem, loop.theta, start, method.tolerance, worth, left, say, deadline
-        )
+        minimum = minimise(problem, loop.theta, start, method.tolerance, worth, left, say, deadline)
         total += minimum.iterations
         if minimum.status is Status.diverged:
             break

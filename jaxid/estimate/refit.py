@@ -289,9 +289,9 @@ def _taps_by_draw(
     return np.array(
         [
             [
-                fit_ar(
-                    [x[there, j] for x, there in zip(rows, kept, strict=True)], filt.order
-                ).taps(size)
+                fit_ar([x[there, j] for x, there in zip(rows, kept, strict=True)], filt.order).taps(
+                    size
+                )
                 for j, filt in enumerate(like)
             ]
             for rows in raw

@@ -122,9 +122,7 @@ def _expected(data: bytes, at: int, order: str, kind: int) -> tuple[bytes, int]:
     return content, after
 
 
-def _numbers(
-    data: bytes, at: int, order: str, shape: tuple[int, ...]
-) -> tuple[np.ndarray, int]:
+def _numbers(data: bytes, at: int, order: str, shape: tuple[int, ...]) -> tuple[np.ndarray, int]:
     stored, content, after = _element(data, at, order)
     if stored not in _STORED:
         raise ValueError(f"numbers are of type {stored}, which there is not")
