@@ -1,34 +1,28 @@
 """The command line: `jaxid demo`, `fit`, `compare`, `discover`."""
 
-import gc
+import contextlib
+import importlib.util
+import itertools
+import json
+import math
+import os
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
 
-# As in the package: a Ctrl-C gets lost in JAX's callback on the garbage collector.
-_collecting = gc.isenabled()
-gc.disable()
+import typer
+from typer.core import TyperCommand
 
-import contextlib  # noqa: E402
-import importlib.util  # noqa: E402
-import itertools  # noqa: E402
-import json  # noqa: E402
-import math  # noqa: E402
-import os  # noqa: E402
-import shutil  # noqa: E402
-import signal  # noqa: E402
-import socket  # noqa: E402
-import sys  # noqa: E402
-import tempfile  # noqa: E402
-import threading  # noqa: E402
-import time  # noqa: E402
-import warnings  # noqa: E402
-from collections.abc import Callable, Iterator  # noqa: E402
-from importlib import resources  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Annotated, Any  # noqa: E402
-
-import typer  # noqa: E402
-from typer.core import TyperCommand  # noqa: E402
-
-from .errors import JaxidError, JaxidWarning, ModelError, RecordingError  # noqa: E402
+from .errors import JaxidError, JaxidWarning, ModelError, RecordingError
 
 ABOUT = """Identify robot arms from closed-loop recordings, and find the effect the model lacks.
 
@@ -595,10 +589,3 @@ def main() -> None:
         if ended.code == INTERRUPTED:
             _leave()
         raise
-
-
-if _collecting:
-    # What was imported counts as old, so that no collection is due at once.
-    gc.freeze()
-    gc.unfreeze()
-    gc.enable()
