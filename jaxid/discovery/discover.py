@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,6 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Float
 
 from ..archive import classes_of
@@ -25,10 +25,10 @@ from ..progress import working
 from ..recording import Recording, Recordings
 from ..simulate import compared
 from .compare import compare
-from .diagnose import Diagnosis, Verdict, diagnose, effect_parameters
+from .diagnose import Diagnosis, Verdict, diagnose
 from .score import whitened
 from .signatures import amplitudes
-from .story import Contender, Discovery, Outcome, Step, effect_on, step_name
+from .story import Contender, Discovery, Outcome, Step, effect_on
 
 
 def discover(
@@ -147,15 +147,16 @@ class _Search(eqx.Module):
         done = "explained" if last.added is not None else "adequate"
         matters = self.matters(steps)
         outside = any(map(matters, last.diagnosis.where))
-        entries = _entries(last.diagnosis, matters)
+        entries = _entries(steps, matters)
         if len(steps) > most or not (entries or outside):
-            return "outside_catalogue" if outside else done, ()
+            faint = self.faint(steps, say) if len(steps) <= most else ()
+            return (None, faint) if faint else ("outside_catalogue" if outside else done, ())
         contenders = self.contenders(last, entries, say)
         if outside and not self.convinces(contenders, last):
             contenders = self.second_thoughts(contenders, entries, last, say)
         if self.convinces(contenders, last):
             return None, (self.grown(last, contenders, say),)
-        if outside and len(steps) < most and (further := self.detour(last, contenders, say)):
+        if outside and len(steps) < most and (further := self.detour(steps, contenders, say)):
             return None, further
         # A weak entry that no refit confirms is chance, unless a curve finds something as well.
         outside = outside and self.confirmed(last, say)
@@ -183,10 +184,11 @@ class _Search(eqx.Module):
 
     def detour(
         self,
-        start: Step,
+        before: Sequence[Step],
         contenders: Sequence[Contender],
         say: Callable[[str], None],
         longest: int = 2,
+        share: float = 1e-3,
     ) -> tuple[Step, ...]:
         """Steps by which effects together leave nothing, where none alone matches the best curve.
 
@@ -194,20 +196,33 @@ class _Search(eqx.Module):
         of both; a second effect shows its true size only when the first is in. That they match the
         curve is not enough: ripples in a row come close to any dependence on position.
         """
-        steps = [start]
-        while contenders and len(steps) <= longest:
+        steps = list(before)
+        while contenders and len(steps) < len(before) + longest:
             last = steps[-1]
             if contenders[0].criterion >= self.criterion(last.fit, last.diagnosis.noise):
                 break
             steps.append(self.grown(last, contenders, say))
-            matters = self.matters([start, steps[-1]])
-            left = _entries(steps[-1].diagnosis, matters)
+            matters = self.matters(steps, share)
+            left = _entries(steps, matters)
             if not left and not any(map(matters, steps[-1].diagnosis.where)):
-                return tuple(steps[1:])
+                return tuple(steps[len(before) :])
             contenders = self.contenders(steps[-1], left, say)
         return ()
 
-    def matters(self, steps: Sequence[Step]) -> Callable[[Verdict], bool]:
+    def faint(
+        self, steps: Sequence[Step], say: Callable[[str], None], share: float = 1e-4
+    ) -> tuple[Step, ...]:
+        """A step by an effect that is small beside those added, if it leaves nothing.
+
+        What rounding leaves of a large effect is never quite another effect of the catalogue.
+        """
+        entries = _entries(steps, self.matters(steps, share))
+        contenders = self.contenders(steps[-1], entries, say)
+        if not self.convinces(contenders, steps[-1]):
+            return ()
+        return self.detour(steps, contenders, say, 1, share)
+
+    def matters(self, steps: Sequence[Step], share: float = 1e-3) -> Callable[[Verdict], bool]:
         """Whether something is significant, and more than what the steps so far leave of rounding.
 
         Steps of the encoders, of the integration, and what a smooth sign makes of a sharp one show
@@ -219,7 +234,7 @@ class _Search(eqx.Module):
         noise = steps[-1].diagnosis.noise
         gone = _whitened_error(steps[0].fit.residuals, noise)
         gone -= _whitened_error(steps[-1].fit.residuals, noise)
-        return lambda v: v.p_value < self.significance and v.explained > 1e-3 * gone
+        return lambda v: v.p_value < self.significance and v.explained > share * gone
 
     def convinces(self, contenders: Sequence[Contender], last: Step) -> bool:
         """Whether the best contender betters the model, and leaves no curve that does much better.
@@ -342,31 +357,35 @@ class _Search(eqx.Module):
     def prune(
         self, steps: list[Step], say: Callable[[str], None]
     ) -> tuple[list[Step], tuple[tuple[str, int | None], ...]]:
-        """Takes out effects that the others have made superfluous."""
+        """Takes out effects that the others have made superfluous, each tried by a refit."""
         removed: list[tuple[str, int | None]] = []
         while True:
             added = [k for k, s in enumerate(steps) if s.added is not None]
-            if len(added) < 2:
+            final, kept = steps[-1], self.criterion(steps[-1].fit, steps[-1].diagnosis.noise)
+            tried = [
+                (self.criterion(found, final.diagnosis.noise), k, found)
+                for place, k in enumerate(added[:-1])
+                for found in [self.without(final, len(added) - place, say)]
+            ]
+            better, weakest, found = min(tried, key=lambda x: x[0], default=(np.inf, 0, final.fit))
+            if not better < kept:
                 return steps, tuple(removed)
-            weakest, p = min(
-                ((k, _need(steps[-1], k, added)) for k in added[:-1]), key=lambda x: -x[1]
-            )
-            if p < self.significance:
-                return steps, tuple(removed)
-            gone = steps[weakest]
-            say(f"again without {step_name(gone)}")
-            position = len(steps[-1].fit.loop.effects) - len(added) + added.index(weakest)
-            loop = steps[-1].fit.loop
-            kept = loop.effects[:position] + loop.effects[position + 1 :]
-            without = dataclasses.replace(loop, effects=kept)
-            found = fit(without, self.recordings, self.whitened_method(steps[-1].diagnosis))
-            assert gone.added is not None
-            removed.append((gone.added.effect_name(), getattr(gone.added, "joint", None)))
-            final = steps[-1]
+            gone = steps[weakest].added
+            assert gone is not None
+            removed.append((gone.effect_name(), getattr(gone, "joint", None)))
             again = self.step(
                 final.label, found, added=final.added, alike=final.alike, contenders=()
             )
             steps = [s for k, s in enumerate(steps[:-1]) if k != weakest] + [again]
+
+    def without(self, final: Step, from_end: int, say: Callable[[str], None]) -> Fit:
+        """The last fit again, without the effect that stands so far from the end of its loop."""
+        loop = final.fit.loop
+        at = len(loop.effects) - from_end
+        gone = loop.effects[at]
+        say(f"again without {effect_on(gone.effect_name(), getattr(gone, 'joint', None))}")
+        less = dataclasses.replace(loop, effects=loop.effects[:at] + loop.effects[at + 1 :])
+        return fit(less, self.recordings, self.whitened_method(final.diagnosis))
 
 
 def _entry(entry: Any) -> Any:
@@ -399,9 +418,22 @@ def _transmissions(diagnosis: Diagnosis) -> list[Verdict]:
     ]
 
 
-def _entries(diagnosis: Diagnosis, matters: Callable[[Verdict], bool]) -> list[Verdict]:
-    """Entries of the ranking that matter and can be added."""
-    return [v for v in diagnosis.ranking if matters(v) and v.possible and v.evidence > 0]
+def _entries(steps: Sequence[Step], matters: Callable[[Verdict], bool]) -> list[Verdict]:
+    """Entries of the last ranking that matter and can be added.
+
+    Twice at the most: two ends of a travel, two harmonics of a ripple. Three of a kind on one joint
+    are a series that comes close to something else.
+    """
+    added = Counter(
+        (s.added.effect_name(), getattr(s.added, "joint", None))
+        for s in steps
+        if s.added is not None
+    )
+    return [
+        v
+        for v in steps[-1].diagnosis.ranking
+        if matters(v) and v.possible and v.evidence > 0 and added[v.key] < 2
+    ]
 
 
 def _leading(entries: Sequence[Verdict]) -> list[Verdict]:
@@ -509,29 +541,3 @@ def _whitened_error(
         mask = np.ones((1, len(r)), bool)
         total += float(np.sum(whitened(r[None], noise, mask) ** 2))
     return total
-
-
-def _need(last: Step, which: int, added: Sequence[int]) -> float:
-    """p-value of an added effect's parameters being nothing, from the whitened information."""
-    loop = last.fit.loop
-    position = len(loop.effects) - len(added) + list(added).index(which)
-    places = [place for place, _, _ in effect_parameters(loop, loop.effects[position])]
-    base = last.diagnosis.data.base
-    data = last.diagnosis.data
-    z = whitened(base, last.diagnosis.noise, data.mask).reshape(-1, base.shape[-1])
-    information = z.T @ z
-    covariance = np.linalg.pinv(information, rcond=1e-12)
-    linear = [p for p in places if _is_amplitude(loop, p)] or places[:1]
-    block = covariance[np.ix_(linear, linear)]
-    values = last.fit.theta[linear]
-    statistic = float(values @ np.linalg.pinv(block, rcond=1e-12) @ values)
-    return float(scipy.stats.chi2.sf(statistic, len(linear)))
-
-
-def _is_amplitude(loop: ClosedLoop, place: int) -> bool:
-    start = 0
-    for p in loop.free_parameters:
-        if start <= place < start + p.size:
-            return p.declaration.linear
-        start += p.size
-    return False
