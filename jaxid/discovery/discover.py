@@ -28,7 +28,7 @@ from .compare import compare
 from .diagnose import Diagnosis, Verdict, diagnose
 from .score import whitened
 from .signatures import amplitudes
-from .story import Contender, Discovery, Outcome, Step, effect_on
+from .story import Contender, Discovery, Outcome, Step, effect_on, step_name
 
 
 def discover(
@@ -80,12 +80,15 @@ def discover(
             )
             steps.extend(more)
         steps, removed = search.prune(steps, say)
+        notes = _notes(steps, most)
+        if search.is_series(steps, say):
+            verdict, notes = "outside_catalogue", (_series_note(steps),)
+            steps, removed = steps[:1], ()
     if verdict != "outside_catalogue" and steps[-1].fit.status is Status.misfit:
         raise FitError(
             f"neither {loop.name} nor the catalogue explains anything of these recordings: "
             f"{steps[-1].fit.notes[-1]}"
         )
-    notes = _notes(steps, most)
     return Discovery(verdict, tuple(steps), removed, notes, time.perf_counter() - started)
 
 
@@ -97,6 +100,18 @@ def _notes(steps: Sequence[Step], most: int) -> tuple[str, ...]:
     if bad:
         notes.append(f"the fit of {', '.join(bad)} did not converge: read its values with care")
     return tuple(notes)
+
+
+def _fitted_criterion(found: Fit, noise: Sequence[ARFilter]) -> float:
+    """Whitened squared error on fitted recordings, and BIC's price."""
+    count = sum(r.size for r in found.residuals)
+    return _whitened_error(found.residuals, noise) + len(found.names) * float(np.log(count))
+
+
+def _series_note(steps: Sequence[Step]) -> str:
+    """What is said of effects that together did less than one curve."""
+    names = ", ".join(step_name(s) for s in steps if s.added is not None)
+    return f"{names} together come close, but one curve does better with less: they were taken out"
 
 
 class _Search(eqx.Module):
@@ -341,9 +356,7 @@ class _Search(eqx.Module):
 
         Less is better; a difference of ten is decisive.
         """
-        total = _whitened_error(found.residuals, noise) + self.unseen_error(found, noise)
-        count = sum(r.size for r in found.residuals)
-        return total + len(found.names) * float(np.log(count))
+        return _fitted_criterion(found, noise) + self.unseen_error(found, noise)
 
     def unseen_error(self, found: Fit, noise: Sequence[ARFilter]) -> float:
         """Whitened squared error on held-out recordings; infinite where the loop runs away."""
@@ -377,6 +390,22 @@ class _Search(eqx.Module):
                 final.label, found, added=final.added, alike=final.alike, contenders=()
             )
             steps = [s for k, s in enumerate(steps[:-1]) if k != weakest] + [again]
+
+    def is_series(self, steps: Sequence[Step], say: Callable[[str], None]) -> bool:
+        """Whether one free-form curve does better than three effects or more in a row.
+
+        Then they are a series that comes close to something else.
+        """
+        last = steps[-1]
+        if sum(s.added is not None for s in steps) < 3:
+            return False
+        top = steps[0].diagnosis.where[0]
+        say(f"refit with a curve on joint {top.hypothesis.joint} in place of all effects")
+        grown = steps[0].fit.loop.add(steps[0].diagnosis.predicted(top))
+        found = fit(grown, self.recordings, self.whitened_method(last.diagnosis))
+        noise = last.diagnosis.noise
+        # On fitted recordings alone: a curve says nothing of what lies beyond them.
+        return _fitted_criterion(found, noise) < _fitted_criterion(last.fit, noise)
 
     def without(self, final: Step, from_end: int, say: Callable[[str], None]) -> Fit:
         """The last fit again, without the effect that stands so far from the end of its loop."""
