@@ -1,5 +1,7 @@
 """What is missing is found, on recordings of a simulator that shares no code with jaxid."""
 
+import dataclasses
+
 import equinox as eqx
 import independent as sim
 import jax.numpy as jnp
@@ -8,8 +10,10 @@ import pytest
 from independent import effects as fx
 
 import jaxid
+from jaxid.discovery.discover import _entries, _Search
 from jaxid.discovery.score import corrected, effective_tests
-from jaxid.effects import AbstractEffect, Curve, Motion, TorqueOffset, on_joint
+from jaxid.discovery.story import Step
+from jaxid.effects import AbstractEffect, Curve, Motion, QuadraticDrag, TorqueOffset, on_joint
 from jaxid.parameters import Scalar, parameter
 
 
@@ -186,6 +190,57 @@ def test_steps_of_other_work_are_refused(offset_case, offset_story):
         jaxid.discover(jaxid.scara(), fit[:1], held_out, resume=journal, progress=False)
     with pytest.raises(jaxid.errors.SaveError, match=r"other work \(not the same: most\)"):
         jaxid.discover(jaxid.scara(), fit, held_out, most=2, resume=journal, progress=False)
+
+
+def with_chain(search: _Search, start: Step, *effects: AbstractEffect) -> list[Step]:
+    """The starting step, and one more for each effect, all in the last one's loop."""
+    steps = [start]
+    for effect in effects:
+        loop = steps[-1].fit.loop.add(effect)
+        fitted = jaxid.fit(loop, search.recordings, search.whitened_method(start.diagnosis))
+        added = fitted.loop.effects[-1]
+        steps.append(dataclasses.replace(start, label="+", fit=fitted, added=added))
+    return steps
+
+
+def search_of(case: sim.Case) -> _Search:
+    return _Search(*recordings_of(case), jaxid.catalogue, jaxid.OEM(), 0.01, False)
+
+
+def silent(*_: object) -> None:
+    """Says nothing."""
+
+
+@pytest.mark.xdist_group("offset")
+def test_superfluous_effect_is_taken_out_and_a_needed_one_stays(offset_case, offset_story):
+    search, start = search_of(offset_case), offset_story[0].steps[0]
+    offset, drag = TorqueOffset(joint=2), QuadraticDrag(joint=1)
+    left, removed = search.prune(with_chain(search, start, drag, offset), silent)
+    assert removed == (("quadratic_drag", 1),)
+    assert [s.added.effect_name() for s in left[1:]] == ["torque_offset"]
+    assert "drag" not in repr(left[-1].fit.loop)
+    assert search.prune(with_chain(search, start, offset, drag), silent)[1] == ()
+
+
+@pytest.mark.xdist_group("offset")
+def test_effect_is_added_twice_at_the_most(offset_story):
+    start = offset_story[0].steps[0]
+    top = next(v for v in start.diagnosis.ranking if v.possible and v.evidence > 0)
+    step = dataclasses.replace(start, added=start.diagnosis.predicted(top))
+    for often in (0, 1):
+        found = _entries([start] + often * [step], lambda v: True)
+        assert top.key in [v.key for v in found]
+    assert top.key not in [v.key for v in _entries([start, step, step], lambda v: True)]
+
+
+@pytest.mark.xdist_group("bump")
+def test_chain_that_a_curve_outdoes_is_a_series(bump_case, bump_story):
+    search, start = search_of(bump_case), bump_story.steps[0]
+    poor = [QuadraticDrag(joint=2), TorqueOffset(joint=2), QuadraticDrag(joint=1)]
+    assert search.is_series(with_chain(search, start, *poor), silent)
+    true = [Bump(joint=2, height=0.05, place=0.5, width=0.25), *poor[:2]]
+    assert not search.is_series(with_chain(search, start, *true), silent)
+    assert not search.is_series(with_chain(search, start, *poor[:2]), silent)
 
 
 @pytest.mark.xdist_group("offset")
