@@ -465,10 +465,10 @@ def deviance(
     """Draw a likelihood profile beside the parabola that its deviation promises.
 
     Arguments:
-        values: At which the parameter was held, shape `(points,)`.
+        values: At which the parameter was held, shape `(points,)`, in `unit`.
         lost: Deviance there, shape `(points,)`.
-        centre: The estimate.
-        std: Its standard deviation.
+        centre: The estimate, in `unit`.
+        std: Its standard deviation, in `unit`.
         name: Of the parameter.
         unit: Of the parameter.
         title: Of the whole figure.

@@ -358,7 +358,8 @@ def inverse(
 ) -> Float[Array, " joints"]:
     """Torque at the joints that a motion takes (the inverse dynamic model), `(joints,)`."""
     rigid = loop.arm.mass_matrix(motion.q) @ motion.a + loop.arm.bias(motion.q, motion.v)
-    return rigid + sum(effect_loads(loop, motion, states), jnp.zeros(()))
+    drive, link = effect_loads(loop, motion, states)
+    return rigid + drive + link
 
 
 def _added_inertia(

@@ -82,8 +82,8 @@ def discover(
         steps, removed = search.prune(steps, say)
         notes = _notes(steps, most)
         if search.is_series(steps, say):
-            verdict, notes = "outside_catalogue", (_series_note(steps),)
-            steps, removed = steps[:1], ()
+            note, steps, removed = _series_note(steps), steps[:1], ()
+            verdict, notes = "outside_catalogue", (*_notes(steps, most), note)
     if verdict != "outside_catalogue" and steps[-1].fit.status is Status.misfit:
         raise FitError(
             f"neither {loop.name} nor the catalogue explains anything of these recordings: "

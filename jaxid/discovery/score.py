@@ -154,7 +154,7 @@ class Gram(eqx.Module):
         return value, freedom
 
     def correlation(self, one: Sequence[int], other: Sequence[int]) -> float:
-        """Largest correlation of what two blocks span, 0 where one says nothing."""
+        """Largest correlation of what two blocks of columns span, 0 where one says nothing."""
         whole = []
         for columns in (list(one), list(other)):
             values, vectors = _strong(self.gram[np.ix_(columns, columns)])

@@ -78,7 +78,8 @@ def split_torque(loop: ClosedLoop, at: Motion, once: bool) -> Float[Array, "4 sa
         first = split.first @ values
         if once:
             twice, first = jnp.zeros_like(twice), first + rate
-        zeroth = split.zeroth @ values + sum(effect_loads(loop, delivered, own), jnp.zeros(()))
+        drive, link = effect_loads(loop, delivered, own)
+        zeroth = split.zeroth @ values + drive + link
         return jnp.stack([twice, first, zeroth, -delivered.tau])
 
     return jnp.moveaxis(jax.vmap(one)(at, states), 1, 0)
