@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..lapack import smallest_eigenvalue
 from ..parameters import list_parameters, read_values, write_values
 
 
@@ -107,5 +108,8 @@ class AbstractArm(eqx.Module):
 
     def smallest_inertia(self) -> Float[Array, ""]:
         """Smallest eigenvalue of the mass matrix over the workspace; above zero when physical."""
-        matrices = jax.vmap(self.mass_matrix)(jnp.asarray(self.workspace()))
-        return jnp.min(jnp.linalg.eigvalsh(matrices))
+
+        def at(q: Float[Array, " joints"]) -> Float[Array, ""]:
+            return smallest_eigenvalue(self.mass_matrix(q))
+
+        return jnp.min(jax.vmap(at)(jnp.asarray(self.workspace())))

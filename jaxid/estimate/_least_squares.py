@@ -12,6 +12,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
+from ..lapack import column_basis
 from ..loop import ClosedLoop
 from ..sharding import everywhere, shared_out
 from ..simulate import SIGNALS, Batch, each, initial, run, run_with_sensitivities
@@ -222,7 +223,7 @@ def absorb_start(found: Sensitivity, free: Float[Array, " recordings"]) -> Sensi
     j = found.jacobian.reshape(count, -1, p)
     s = (found.start * free[:, None, None, None]).reshape(count, j.shape[1], -1)
     # Columns may be alike, or nil where a start is given: only a full decomposition says so.
-    basis, size, _ = jnp.linalg.svd(s, full_matrices=False)
+    basis, size = jax.vmap(column_basis)(s)
     basis = jnp.where((size > 1e-10 * size[:, :1])[:, None, :], basis, 0.0)
     j = j - basis @ jnp.einsum("rka,rkp->rap", basis, j)
     return Sensitivity(found.raw, found.residual, j.reshape(found.jacobian.shape), None)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..errors import FitError
+from ..lapack import solve
 from ..noise import ARFilter, VectorAR, fit_ar
 from ._base import Fit
 from ._least_squares import (
@@ -108,7 +109,7 @@ def _bounded_step(
         size = jnp.einsum("raa->ra", point.start_gram)
         own = jnp.where(size > 0, (1e-10 + damping) * size, 1.0)[..., None] * jnp.eye(initials)
         pair = jnp.concatenate([point.cross, point.start_slope[..., None]], axis=2)
-        inner = jnp.linalg.solve(point.start_gram + own, pair)
+        inner = jax.vmap(solve)(point.start_gram + own, pair)
         reduced = reduced - jnp.einsum("rap,raq->pq", point.cross, inner[..., :-1])
         push = push - jnp.einsum("rap,ra->p", point.cross, inner[..., -1])
     scaled = reduced / jnp.outer(width, width) + (1e-12 + damping) * jnp.eye(len(width))
@@ -120,7 +121,7 @@ def _bounded_step(
         held = jnp.where(stuck, jnp.clip(step, low, high), 0.0)
         matrix = jnp.where(stuck[:, None] | stuck, jnp.eye(len(push)), scaled)
         right = jnp.where(stuck, held, -push - scaled @ held)
-        step = jnp.linalg.solve(matrix, right)
+        step = solve(matrix, right)
         stuck = stuck | (step < low) | (step > high)
     step = jnp.clip(step, low, high) / width
     start_step = jnp.zeros_like(point.start)
@@ -174,7 +175,7 @@ def _own_columns(problem: Problem, point: Point) -> Float[Array, "recordings sam
     there = jnp.diag(jnp.where(problem.coefficients.there, 0.0, 1.0))
     gram = jnp.einsum("rkoa,rkob->ab", past, past) + there
     cross = jnp.einsum("rkoa,rkop->ap", past, own)
-    return own - past @ jnp.linalg.solve(gram, cross)
+    return own - past @ solve(gram, cross)
 
 
 @eqx.filter_jit

@@ -1,0 +1,33 @@
+"""LAPACK's decompositions of small matrices, one after the other under `vmap`.
+
+jaxlib (0.10) hands a batch of matrices out to the threads of the pool of which the caller is one.
+Where two batches are in flight on two cores both threads wait, nobody works, and the program
+stands still for good. A matrix by itself is done where it is asked for.
+"""
+
+import jax.numpy as jnp
+from jax.custom_batching import sequential_vmap
+from jaxtyping import Array, Float
+
+
+@sequential_vmap
+def solve(
+    matrix: Float[Array, "size size"], right: Float[Array, "size *columns"]
+) -> Float[Array, "size *columns"]:
+    """The solution of matrix @ x = right."""
+    return jnp.linalg.solve(matrix, right)
+
+
+@sequential_vmap
+def column_basis(
+    matrix: Float[Array, "rows columns"],
+) -> tuple[Float[Array, "rows rank"], Float[Array, " rank"]]:
+    """Left singular vectors and singular values, largest first."""
+    basis, size, _ = jnp.linalg.svd(matrix, full_matrices=False)
+    return basis, size
+
+
+@sequential_vmap
+def smallest_eigenvalue(matrix: Float[Array, "size size"]) -> Float[Array, ""]:
+    """Of a symmetric matrix."""
+    return jnp.linalg.eigvalsh(matrix)[0]
