@@ -72,6 +72,20 @@ def test_what_it_closes_over_may_be_used_in_a_loop_and_after_it():
     np.testing.assert_allclose(after, weights * jnp.sin(x), rtol=1e-14)
 
 
+def test_products_and_sums_have_gradients():
+    # By forward and by reverse mode: both go through what was written out.
+    m = jnp.array([[0.5, 2.0], [1.0, -0.3]])
+
+    def whole(x):
+        return jnp.sum(m @ jnp.sin(x * (m @ x)))
+
+    x = jnp.array([0.4, -0.7])
+    expected = jax.grad(whole)(x)
+    for derivative in (jax.grad, jax.jacfwd):
+        found = derivative(lambda z: unrolled(whole, z)(z))(x)
+        np.testing.assert_allclose(found, expected, rtol=1e-13)
+
+
 class _Lapack(jaxid.effects.AbstractEffect):
     """A user's effect with a decomposition in it."""
 

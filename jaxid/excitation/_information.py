@@ -15,6 +15,7 @@ from ..parameters import Parameter, read_values, write_values
 from ..simulate import NOBODY, Interval, initial, run_with_sensitivities
 
 Kind = Literal["inverse-dynamics", "closed-loop"]
+Criterion = Literal["determinant", "deviation", "condition"]
 
 
 def along(time: Float[Array, " points"], signals: Float[Array, "3 points joints"]) -> Motion:
@@ -107,21 +108,34 @@ def information_of(
     return jnp.einsum("kjp,kjq->pq", scaled, scaled)
 
 
-def log_deviation(
+def _by_size(
     information: Float[Array, "parameters parameters"], scales: Float[Array, " parameters"]
-) -> Float[Array, ""]:
-    """Logarithm of the geometric mean of the deviations, each in units of its scale.
-
-    With correlations in it: half the log det of the covariance, by parameter.
-    """
+) -> tuple[Float[Array, "parameters parameters"], Float[Array, " parameters"]]:
+    """Correlations of the columns, and their lengths, each parameter in units of its scale."""
     p = information.shape[0]
     scaled = information * jnp.outer(scales, scales)
     size = jnp.sqrt(jnp.diag(scaled))
     size = jnp.where(size > 0, size, 1.0)
-    correlated = scaled / jnp.outer(size, size)
     # What cannot be told apart has no deviation; a floor at rounding keeps the search going.
-    value = jnp.linalg.slogdet(correlated + 1e-13 * jnp.eye(p))[1] + 2 * jnp.sum(jnp.log(size))
-    return -value / (2 * p)
+    return scaled / jnp.outer(size, size) + 1e-13 * jnp.eye(p), size
+
+
+def log_volume(
+    information: Float[Array, "parameters parameters"], scales: Float[Array, " parameters"]
+) -> Float[Array, ""]:
+    """Half the log det of the covariance, by parameter: the size of the ellipsoid of errors."""
+    correlated, size = _by_size(information, scales)
+    value = jnp.linalg.slogdet(correlated)[1] + 2 * jnp.sum(jnp.log(size))
+    return -value / (2 * information.shape[0])
+
+
+def log_deviation(
+    information: Float[Array, "parameters parameters"], scales: Float[Array, " parameters"]
+) -> Float[Array, ""]:
+    """Logarithm of the geometric mean of the deviations, each in units of its scale."""
+    correlated, size = _by_size(information, scales)
+    variances = jnp.diag(jnp.linalg.inv(correlated))
+    return jnp.mean(jnp.log(jnp.maximum(variances, 1.0)) / 2 - jnp.log(size))
 
 
 def log_condition(
@@ -136,11 +150,11 @@ class Settings(eqx.Module):
     """How references are judged: which information, which criterion, how much noise."""
 
     kind: Kind = eqx.field(static=True)
-    criterion: Literal["deviation", "condition"] = eqx.field(static=True)
+    criterion: Criterion = eqx.field(static=True)
     noise: Float[np.ndarray, " joints"]
     scales: Float[np.ndarray, " parameters"]
 
     def judge(self, information: Float[Array, "parameters parameters"]) -> Float[Array, ""]:
         """The criterion, to be made small."""
-        by = log_deviation if self.criterion == "deviation" else log_condition
-        return by(information, jnp.asarray(self.scales))
+        by = {"determinant": log_volume, "deviation": log_deviation, "condition": log_condition}
+        return by[self.criterion](information, jnp.asarray(self.scales))

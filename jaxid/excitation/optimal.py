@@ -2,7 +2,7 @@
 
 import html
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -24,6 +24,7 @@ from ..recording import Recording, Recordings
 from ..showing import AbstractShown
 from ..simulate import fastest_rate, set_substeps
 from ._information import (
+    Criterion,
     Kind,
     Settings,
     chosen_parameters,
@@ -38,6 +39,8 @@ from .limits import Limits
 _SLACK = 1e-3
 # The grid on which a result is checked is so many times as fine.
 _FINER = 10
+# How often points that a descent has overlooked are imposed before the step is shortened.
+_EXCHANGES = 4
 
 
 class Design(eqx.Module):
@@ -109,13 +112,18 @@ def _feasible_share(
 ) -> Float[Array, ""]:
     """The largest share of the way from a pose to a reference at which all limits hold."""
 
+    def good(share):
+        return jnp.min(_margins(design, centre + share * (z - centre))) >= _SLACK
+
     def body(_, bounds):
         low, high = bounds
         middle = (low + high) / 2
-        good = jnp.min(_margins(design, centre + middle * (z - centre))) >= _SLACK
-        return jnp.where(good, middle, low), jnp.where(good, high, middle)
+        fits = good(middle)
+        return jnp.where(fits, middle, low), jnp.where(fits, high, middle)
 
-    return jax.lax.fori_loop(0, 20, body, (jnp.zeros(()), jnp.ones(())))[0]
+    found = jax.lax.fori_loop(0, 20, body, (jnp.zeros(()), jnp.ones(())))[0]
+    # A smaller motion may pass a limit that a larger one keeps.
+    return jnp.where(good(1.0), 1.0, found)
 
 
 @eqx.filter_jit
@@ -146,7 +154,8 @@ class Excitation(AbstractShown):
     - `std`: predicted standard deviations of the parameters `names`, for one period and the torque
       noise that was assumed.
     - `margins`: by limit and joint, how much of it is left, in percent; none is negative.
-    - `score`: the criterion; for deviations the logarithm of their geometric mean, in scales.
+    - `score`: logarithm of the criterion, parameters in units of their scales; of the determinant
+      the root that makes it a deviation.
     """
 
     loop: ClosedLoop
@@ -309,7 +318,7 @@ def make_design(
     harmonics: int = 5,
     rate: float = 100.0,
     kind: Kind = "inverse-dynamics",
-    criterion: Literal["deviation", "condition"] = "deviation",
+    criterion: Criterion = "determinant",
     noise: Sequence[float] | np.ndarray | None = None,
     start: Sequence[float] | np.ndarray | None = None,
 ) -> tuple[Design, Float[np.ndarray, " numbers"]]:
@@ -396,14 +405,18 @@ def random_references(
     return drawn, np.where(np.isfinite(scores), np.asarray(scores), np.inf)
 
 
-def _active(margins: Float[np.ndarray, "points kinds"], reach: float) -> np.ndarray:
-    """Where limits may soon bind: points that come near each, and where it comes nearest."""
+def _dips(margins: Float[np.ndarray, "points kinds"]) -> np.ndarray:
+    """Where each limit comes nearest, and the points beside; bool, (points, kinds)."""
     before, after = np.roll(margins, 1, axis=0), np.roll(margins, -1, axis=0)
     nearest = (margins <= before) & (margins <= after)
-    nearest |= np.roll(nearest, 2, axis=0) | np.roll(nearest, -2, axis=0)
-    coarse = np.zeros_like(nearest)
+    return nearest | np.roll(nearest, 1, axis=0) | np.roll(nearest, -1, axis=0)
+
+
+def _active(margins: Float[np.ndarray, "points kinds"], reach: float) -> np.ndarray:
+    """Where limits may soon bind; bool, (points, kinds)."""
+    coarse = np.zeros_like(margins, bool)
     coarse[::8] = True
-    return np.argwhere((margins < 1.5 * reach) & (nearest | coarse))
+    return (margins < 1.5 * reach) & (_dips(margins) | coarse)
 
 
 def _improve(
@@ -442,13 +455,40 @@ def _descend(
     reach: float,
     box: Float[np.ndarray, " numbers"],
 ) -> Float[np.ndarray, " numbers"]:
-    """SLSQP from a reference that keeps all limits, within a box around it."""
-    margins = np.asarray(_margins_and_slopes(design, jnp.asarray(z))[0])
-    points, kinds = _active(margins, reach).T
+    """SLSQP from a reference that keeps all limits, within a box around it.
+
+    Where what it finds passes a limit at a point that was not imposed, that is imposed too, and
+    the descent goes on from there (exchange method, Hettich and Kortanek 1993).
+    """
+    low, high, found = z - box, z + box, z
+    imposed = _active(_margins_at(design, z), reach)
+    for _ in range(_EXCHANGES):
+        found = _descend_on(design, found, np.stack([low, high], axis=1), imposed)
+        margins = _margins_at(design, found)
+        passed = (margins < _SLACK) & _dips(margins) & ~imposed
+        if not passed.any():
+            break
+        imposed |= passed
+    return found
+
+
+def _margins_at(
+    design: Design, z: Float[np.ndarray, " numbers"]
+) -> Float[np.ndarray, "points kinds"]:
+    return np.asarray(_margins_and_slopes(design, jnp.asarray(z))[0])
+
+
+def _descend_on(
+    design: Design,
+    z: Float[np.ndarray, " numbers"],
+    bounds: Float[np.ndarray, "numbers 2"],
+    imposed: np.ndarray,
+) -> Float[np.ndarray, " numbers"]:
+    """SLSQP with limits imposed at points, bool (points, kinds)."""
+    points, kinds = np.nonzero(imposed)
 
     def limits(x):
-        margins = np.asarray(_margins_and_slopes(design, jnp.asarray(x))[0])
-        return margins[points, kinds] - 2 * _SLACK
+        return _margins_at(design, x)[points, kinds] - 2 * _SLACK
 
     def slopes(x):
         return np.asarray(_margins_and_slopes(design, jnp.asarray(x))[1])[points, kinds]
@@ -462,7 +502,7 @@ def _descend(
         z,
         jac=True,
         method="SLSQP",
-        bounds=np.stack([z - box, z + box], axis=1),
+        bounds=bounds,
         constraints={"type": "ineq", "fun": limits, "jac": slopes},
         options={"maxiter": 30, "ftol": 1e-4},
     )
@@ -515,7 +555,7 @@ def optimal_excitation(
     harmonics: int = 5,
     rate: float = 100.0,
     kind: Kind = "inverse-dynamics",
-    criterion: Literal["deviation", "condition"] = "deviation",
+    criterion: Criterion = "determinant",
     noise: Sequence[float] | np.ndarray | None = None,
     start: Sequence[float] | np.ndarray | None = None,
     tries: int = 200,
@@ -537,7 +577,8 @@ def optimal_excitation(
     - `period`: s. `harmonics`: how many. `rate`: at which it will be sampled, Hz.
     - `kind`: `"inverse-dynamics"` for regressions, `"closed-loop"` for `OEM`: the sensitivities of
       the simulated loop, whose motion and torque must then keep the limits too.
-    - `criterion`: `"deviation"` (log det of the information) or `"condition"` (of the columns).
+    - `criterion`: what is made small: `"determinant"` (of the covariance), `"deviation"` (geometric
+      mean of the standard deviations) or `"condition"` (of the columns).
     - `noise`: deviation of torque noise, one or one a joint, N·m or N; a hundredth of the limits
       where None.
     - `start`: pose to start and end at, `(joints,)`; any where None.
