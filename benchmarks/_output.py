@@ -15,9 +15,9 @@ def options(description: str | None) -> argparse.Namespace:
     return parser.parse_args()
 
 
-def report(table: pd.DataFrame, json_file: Path | None, decimals: int = 3) -> None:
+def report(table: pd.DataFrame, json_file: Path | None, form: str = ".3f") -> None:
     """Prints a table, and writes it as JSON records where a file is named."""
-    print(table.to_string(float_format=lambda x: f"{x:.{decimals}f}"))
+    print(table.to_string(float_format=lambda x: format(x, form)))
     if json_file is not None:
         records = table.reset_index().to_dict(orient="records")
         json_file.write_text(json.dumps(records, indent=1, ensure_ascii=False) + "\n")

@@ -87,7 +87,7 @@ def table(quick: bool = False) -> pd.DataFrame:
 def main() -> None:
     """Prints the table."""
     given = options(__doc__)
-    report(table(given.quick), given.json, 1)
+    report(table(given.quick), given.json, ".1f")
 
 
 if __name__ == "__main__":

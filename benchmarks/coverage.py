@@ -11,6 +11,7 @@ bias of five methods when encoder noise goes round the loop.
 
 import dataclasses
 import json
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -237,7 +238,9 @@ def main() -> None:
     m = motion(1, "fit")
     content: dict[str, object] = {"draws": draws, "levels": LEVELS}
     for colour in ("coloured", "white"):
-        *_, result = study(m, draws, colour == "coloured")
+        for result in study(m, draws, colour == "coloured"):
+            done = len(result.found["LS"][0])
+            print(f"{colour} noise: {done} of {draws} draws", file=sys.stderr, flush=True)
         print(f"\n{colour} noise, {draws} draws; not settled: {result.unsettled}")
         for title, table in tables(result).items():
             print(f"\n{title}\n{table.to_string(float_format=lambda x: f'{x:.2f}')}")

@@ -264,7 +264,7 @@ def main() -> None:
     if not given.quick:
         rows += table(recordings(many, seconds), budget)
     rows += success(recordings(1 if given.quick else 2, seconds), draws)
-    report(pd.DataFrame(rows).set_index(["task", "recordings", "way"]), given.json, decimals=6)
+    report(pd.DataFrame(rows).set_index(["task", "recordings", "way"]), given.json, form=".6f")
 
 
 if __name__ == "__main__":

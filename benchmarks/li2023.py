@@ -221,10 +221,20 @@ def table(found: Estimates) -> pd.DataFrame:
 
 
 def figure(found: pd.DataFrame) -> go.Figure:
-    """Error against resolution, a line a method."""
+    """Error against resolution: a colour a family, dashed where weighted, open where smoothed."""
     drawn = go.Figure()
+    families = {"difference": 0, "filtered": 1, "integral": 2, "Fourier": 3, "OEM": 4}
+    colours = figures.theme().layout.colorway
     for name, rows in found.groupby("method", sort=False):
-        drawn.add_scatter(x=rows["bits"], y=rows["inertial"], name=str(name), mode="lines+markers")
+        family = next(k for word, k in families.items() if word in str(name))
+        drawn.add_scatter(
+            x=rows["bits"],
+            y=rows["inertial"],
+            name=str(name),
+            mode="lines+markers",
+            line={"color": colours[family], "dash": "dot" if "weighted" in str(name) else "solid"},
+            marker={"symbol": "circle-open" if "low-passed" in str(name) else "circle", "size": 9},
+        )
     drawn.update_layout(
         template=figures.theme(),
         width=860,

@@ -58,7 +58,7 @@ def main() -> None:
     """Prints the table, and the deviations' own deviation: 1 where they are honest."""
     given = options(__doc__)
     found = table(3 if given.quick else DRAWS)
-    report(found, given.json, 2)
+    report(found, given.json, ".2f")
     away = found.drop(columns=["worst", "status", "iterations", "seconds"]).to_numpy(float)
     print(f"within 4 deviations: {np.sum(np.abs(away).max(axis=1) < 4)} of {len(found)}")
     print(f"root mean square of all: {np.sqrt(np.mean(away**2)):.2f}")

@@ -158,12 +158,13 @@ def test_criteria_are_what_they_are_called():
 def test_a_reference_that_keeps_its_limits_is_not_drawn_in():
     # Half as large a motion would pass the workspace, whose middle is out of bounds.
     ring = jaxid.Limits(**ROOM | {"torque": [60, 20], "workspace": lambda q: q[:1] ** 2 - 0.2})
-    design, centre = optimal.make_design(loop(), ring, period=4.0, harmonics=2, rate=100.0)
-    numbers = np.zeros(design.shape)
-    still = design.base + np.array([[0.9, 0.0]] + [[0.0, 0.0]] * 4)
-    numbers = np.linalg.lstsq(design.span, still - design.base, rcond=None)[0].ravel()
-    opposite = np.linalg.lstsq(design.span, -still, rcond=None)[0].ravel()
-    share = optimal._feasible_share(design, jnp.asarray(opposite), jnp.asarray(numbers))
+    design, _ = optimal.make_design(loop(), ring, period=4.0, harmonics=2, rate=100.0)
+    still = np.array([[0.9, 0.0]] + [[0.0, 0.0]] * 4)
+    there, opposite = (
+        jnp.asarray(np.linalg.lstsq(design.span, pose, rcond=None)[0].ravel())
+        for pose in (still, -still)
+    )
+    share = optimal._feasible_share(design, opposite, there)
     assert float(share) == 1.0
 
 

@@ -14,7 +14,7 @@ from jaxid.estimate.refit import Lanes, _refit_some
 from jaxid.lapack import column_basis, smallest_eigenvalue, solve
 
 DEMO = Path(jaxid.__file__).parent / "demo" / "clean"
-# A call with its operands' shapes, as in `stablehlo.custom_call @lapack_dgetrf_ffi(%0) … tensor<…>`.
+# A call with the shapes it is given: `custom_call @lapack_dgetrf_ffi(%0) … : (tensor<5x4x4xf64>)`.
 CALL = re.compile(r"custom_call @lapack_(\w+).*?: \(([^)]*)\)")
 
 

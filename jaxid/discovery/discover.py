@@ -330,14 +330,14 @@ class _Search(eqx.Module):
         The filters it was judged by knew its effect from a signature only, so some of it may have
         passed for noise. And what was screened at a finite setting has shapes that only a good fit
         can tell (how stiff a backlash's contact is): held at a wrong value they leave something to
-        explain.
+        explain, and estimated from there they may end in a valley beside the right one.
         """
         loop = best.fit.loop
         held = () if amplitudes(loop.effects[-1]) else _held_shapes(loop)
         found = [best.fit]
-        for names in [(), held] if held else [()]:
+        for start in (loop, *_released(loop, held)):
             say(f"refit of {effect_on(best.name, best.joint)} with its own noise")
-            found.append(fit(loop.free(*names), self.recordings, self.alternating()))
+            found.append(fit(start, self.recordings, self.alternating()))
         chosen = min((f for f in found if f.succeeded), key=_bic, default=best.fit)
         return Contender(best.name, best.joint, chosen, best.criterion)
 
@@ -370,26 +370,50 @@ class _Search(eqx.Module):
     def prune(
         self, steps: list[Step], say: Callable[[str], None]
     ) -> tuple[list[Step], tuple[tuple[str, int | None], ...]]:
-        """Takes out effects that the others have made superfluous, each tried by a refit."""
+        """Takes out effects that the others have made superfluous, each tried by a refit.
+
+        An early effect may also have won by what a later one explains (a spring that stood in for
+        an offset and some of a wrong gain): its rivals, where they need no more parameters, are
+        tried in its place.
+        """
         removed: list[tuple[str, int | None]] = []
         while True:
-            added = [k for k, s in enumerate(steps) if s.added is not None]
             final, kept = steps[-1], self.criterion(steps[-1].fit, steps[-1].diagnosis.noise)
-            tried = [
-                (self.criterion(found, final.diagnosis.noise), k, found)
-                for place, k in enumerate(added[:-1])
-                for found in [self.without(final, len(added) - place, say)]
-            ]
-            better, weakest, found = min(tried, key=lambda x: x[0], default=(np.inf, 0, final.fit))
+            tried = self.changed(steps, say)
+            better, place, rival, found = min(
+                tried, key=lambda x: x[0], default=(np.inf, 0, None, final.fit)
+            )
             if not better < kept:
                 return steps, tuple(removed)
-            gone = steps[weakest].added
+            gone = steps[place].added
             assert gone is not None
-            removed.append((gone.effect_name(), getattr(gone, "joint", None)))
             again = self.step(
                 final.label, found, added=final.added, alike=final.alike, contenders=()
             )
-            steps = [s for k, s in enumerate(steps[:-1]) if k != weakest] + [again]
+            between = [s for k, s in enumerate(steps[:-1]) if k != place]
+            if rival is None:
+                removed.append((gone.effect_name(), getattr(gone, "joint", None)))
+            else:
+                others = [c for c in steps[place].contenders if c is not rival]
+                before = steps[place - 1]
+                between.insert(place, self.grown(before, [rival, *others], say))
+            steps = [*between, again]
+
+    def changed(
+        self, steps: Sequence[Step], say: Callable[[str], None]
+    ) -> list[tuple[float, int, Contender | None, Fit]]:
+        """The last model without each earlier effect, and with each one's rivals in its place.
+
+        **Returns:** criterion, number of the step, the rival if there is one, and the fit.
+        """
+        final, found = steps[-1], []
+        added = [k for k, s in enumerate(steps) if s.added is not None]
+        for at, k in enumerate(added[:-1]):
+            for rival in (None, *_rivals(steps[k])):
+                refitted = self.replaced(final, len(added) - at, rival, say)
+                value = self.criterion(refitted, final.diagnosis.noise)
+                found.append((value, k, rival, refitted))
+        return found
 
     def is_series(self, steps: Sequence[Step], say: Callable[[str], None]) -> bool:
         """Whether one free-form curve does better than three effects or more in a row.
@@ -407,13 +431,21 @@ class _Search(eqx.Module):
         # On fitted recordings alone: a curve says nothing of what lies beyond them.
         return _fitted_criterion(found, noise) < _fitted_criterion(last.fit, noise)
 
-    def without(self, final: Step, from_end: int, say: Callable[[str], None]) -> Fit:
-        """The last fit again, without the effect that stands so far from the end of its loop."""
+    def replaced(
+        self, final: Step, from_end: int, rival: Contender | None, say: Callable[[str], None]
+    ) -> Fit:
+        """The last fit again, with a rival or nothing for the effect so far from the loop's end."""
         loop = final.fit.loop
         at = len(loop.effects) - from_end
         gone = loop.effects[at]
-        say(f"again without {effect_on(gone.effect_name(), getattr(gone, 'joint', None))}")
-        less = dataclasses.replace(loop, effects=loop.effects[:at] + loop.effects[at + 1 :])
+        instead = () if rival is None else rival.fit.loop.effects[-1:]
+        with_what = "" if rival is None else f", with {effect_on(rival.name, rival.joint)}"
+        say(
+            f"again without {effect_on(gone.effect_name(), getattr(gone, 'joint', None))}"
+            f"{with_what}"
+        )
+        effects = (*loop.effects[:at], *instead, *loop.effects[at + 1 :])
+        less = dataclasses.replace(loop, effects=effects)
         return fit(less, self.recordings, self.whitened_method(final.diagnosis))
 
 
@@ -509,6 +541,17 @@ def _bic(found: Fit) -> float:
     return float(spread + free * np.log(count * joints))
 
 
+def _rivals(step: Step, most: int = 2) -> list[Contender]:
+    """Other effects that were refitted in a step, and have no more to adjust than the chosen."""
+    chosen = step.contenders[:1]
+    return [
+        c
+        for c in step.contenders[1:]
+        if (c.name, c.joint) != (chosen[0].name, chosen[0].joint)
+        and len(c.fit.names) <= len(step.fit.names)
+    ][:most]
+
+
 def _held_shapes(loop: ClosedLoop) -> tuple[str, ...]:
     """Names of the last effect's parameters that no fit estimates unless told to."""
     last = ("effects", len(loop.effects) - 1)
@@ -517,6 +560,15 @@ def _held_shapes(loop: ClosedLoop) -> tuple[str, ...]:
         for p in loop.parameters
         if p.where.steps[:2] == last and not p.declaration.free  # type: ignore[attr-defined]
     )
+
+
+def _released(loop: ClosedLoop, names: Sequence[str]) -> list[ClosedLoop]:
+    """The loop with these values free: from where they are, and from half and twice each."""
+    if not names:
+        return []
+    given = {p.name: float(np.asarray(p.where(loop))) for p in loop.parameters if p.name in names}
+    changes = [{}, *({name: f * given[name]} for name in names for f in (0.5, 2.0))]
+    return [loop.with_values(**change).free(*names) for change in changes]
 
 
 def _inside(effect: AbstractEffect) -> AbstractEffect:
