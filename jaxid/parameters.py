@@ -186,6 +186,8 @@ def set_by_name(model: Any, **values: float) -> Any:
 
     **Raises:** `ModelError` for a name the model does not have.
     """
+    if not values:
+        return model
     known = {p.name: p for p in list_parameters(model)}
     for name in values:
         if name not in known:

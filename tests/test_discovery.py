@@ -10,10 +10,19 @@ import pytest
 from independent import effects as fx
 
 import jaxid
-from jaxid.discovery.discover import _entries, _Search
+from jaxid.discovery.discover import _entries, _released, _rivals, _Search
 from jaxid.discovery.score import corrected, effective_tests
-from jaxid.discovery.story import Step
-from jaxid.effects import AbstractEffect, Curve, Motion, QuadraticDrag, TorqueOffset, on_joint
+from jaxid.discovery.story import Contender, Step
+from jaxid.effects import (
+    AbstractEffect,
+    Backlash,
+    Curve,
+    Motion,
+    QuadraticDrag,
+    Spring,
+    TorqueOffset,
+    on_joint,
+)
 from jaxid.parameters import Scalar, parameter
 
 
@@ -220,6 +229,40 @@ def test_superfluous_effect_is_taken_out_and_a_needed_one_stays(offset_case, off
     assert [s.added.effect_name() for s in left[1:]] == ["torque_offset"]
     assert "drag" not in repr(left[-1].fit.loop)
     assert search.prune(with_chain(search, start, offset, drag), silent)[1] == ()
+
+
+@pytest.mark.xdist_group("offset")
+def test_rival_with_less_takes_the_place_of_an_early_effect(offset_case, offset_story):
+    search, start = search_of(offset_case), offset_story[0].steps[0]
+    spring, drag = Spring(joint=2), QuadraticDrag(joint=1)
+    steps = with_chain(search, start, spring, drag)
+    fits = steps[1].fit, with_chain(search, start, TorqueOffset(joint=2))[1].fit
+    contenders = tuple(
+        Contender(name, 2, fitted, search.criterion(fitted, start.diagnosis.noise))
+        for name, fitted in zip(("spring", "torque_offset"), fits, strict=True)
+    )
+    steps[1] = dataclasses.replace(steps[1], contenders=contenders)
+    left, removed = search.prune(steps, silent)
+    assert removed == ()
+    assert [s.added.effect_name() for s in left[1:]] == ["torque_offset", "quadratic_drag"]
+    assert [type(e) for e in left[-1].fit.loop.effects[-2:]] == [TorqueOffset, QuadraticDrag]
+    assert left[1].contenders[0].name == "torque_offset"
+    # Not the other way round: a spring has more to adjust than an offset.
+    assert _rivals(dataclasses.replace(left[1], contenders=contenders[::-1])) == []
+
+
+def test_contact_is_released_from_several_stiffnesses():
+    loop = jaxid.scara().add(Backlash(joint=2, gap=0.01, stiffness=200.0, damping=2.0))
+    released = _released(loop, ("kc2", "dk2"))
+    values = [dict(zip(r.names, np.asarray(r.theta), strict=True)) for r in released]
+    assert [(v["kc2"], v["dk2"]) for v in values] == [
+        (200.0, 2.0),
+        (100.0, 2.0),
+        (400.0, 2.0),
+        (200.0, 1.0),
+        (200.0, 4.0),
+    ]
+    assert _released(loop, ()) == []
 
 
 @pytest.mark.xdist_group("offset")
