@@ -354,18 +354,21 @@ class _Search(eqx.Module):
     def criterion(self, found: Fit, noise: Sequence[ARFilter]) -> float:
         """Whitened squared error on fitted and held-out recordings, and BIC's price.
 
-        Less is better; a difference of ten is decisive.
+        Less is better; a difference of ten is decisive. Infinite where the fit runs away.
         """
-        return _fitted_criterion(found, noise) + self.unseen_error(found, noise)
+        value = _fitted_criterion(found, noise) + self.unseen_error(found, noise)
+        return value if np.isfinite(value) else np.inf
 
     def unseen_error(self, found: Fit, noise: Sequence[ARFilter]) -> float:
         """Whitened squared error on held-out recordings; infinite where the loop runs away."""
         if self.held_out is None:
             return 0.0
         try:
-            return _whitened_error(_held_residuals(found, self.held_out), noise)
+            with np.errstate(over="ignore", invalid="ignore"):
+                error = _whitened_error(_held_residuals(found, self.held_out), noise)
         except (ArithmeticError, ValueError, RuntimeError):
             return np.inf
+        return error if np.isfinite(error) else np.inf
 
     def prune(
         self, steps: list[Step], say: Callable[[str], None]
