@@ -17,14 +17,14 @@ def working(title: str, show: bool = True) -> Iterator[Callable[..., None]]:
     - `show`: False to stay silent everywhere.
     """
     if not show:
-        yield _silent
+        yield silent
         return
     # Here, since most of a short command's life goes into imports.
     from rich.console import Console
 
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield _silent
+        yield silent
         return
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
@@ -42,5 +42,5 @@ def working(title: str, show: bool = True) -> Iterator[Callable[..., None]]:
         yield say
 
 
-def _silent(text: str, share: float | None = None) -> None:
+def silent(text: str, share: float | None = None) -> None:
     """Says nothing."""

@@ -1,5 +1,8 @@
 """Prediction error methods on a robot that jaxid did not simulate, and what they say of errors."""
 
+import contextlib
+import sys
+
 import independent as sim
 import jax.numpy as jnp
 import numpy as np
@@ -191,6 +194,21 @@ def test_what_the_data_do_not_allow_is_refused_and_the_fit_kept(fits, recording,
         jaxid.fit(jaxid.scara(), recording, method)
     if isinstance(method, jaxid.SeparablePEM):
         assert np.allclose(caught.value.fit.theta, fits["oem"].theta)
+
+
+def test_many_fits_tell_how_far_they_are(fits, monkeypatch):
+    said = []
+
+    @contextlib.contextmanager
+    def recorded(title, show):
+        yield lambda text, share=None: said.append((title, show, text, share))
+
+    # The package has a function of that name where the module was.
+    monkeypatch.setattr(sys.modules["jaxid.estimate.bootstrap"], "working", recorded)
+    jaxid.bootstrap(fits["oem"], 20, progress=False)
+    assert said == [
+        ("bootstrap of scara", False, f"{done} of 20 fits", done / 20) for done in (0, 8, 16)
+    ]
 
 
 def test_regressions_have_no_bootstrap(recording):

@@ -380,14 +380,15 @@ class _Search(eqx.Module):
         tried in its place.
         """
         removed: list[tuple[str, int | None]] = []
-        while True:
+        # Noise is estimated anew each time, so that two rivals might take turns for ever.
+        for _ in range(2 * len(steps)):
             final, kept = steps[-1], self.criterion(steps[-1].fit, steps[-1].diagnosis.noise)
             tried = self.changed(steps, say)
             better, place, rival, found = min(
                 tried, key=lambda x: x[0], default=(np.inf, 0, None, final.fit)
             )
             if not better < kept:
-                return steps, tuple(removed)
+                break
             gone = steps[place].added
             assert gone is not None
             again = self.step(
@@ -401,6 +402,7 @@ class _Search(eqx.Module):
                 before = steps[place - 1]
                 between.insert(place, self.grown(before, [rival, *others], say))
             steps = [*between, again]
+        return steps, tuple(removed)
 
     def changed(
         self, steps: Sequence[Step], say: Callable[[str], None]

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from .. import figures
 from ..errors import FitError
 from ..noise import ARFilter, VectorAR, fit_ar
+from ..progress import working
 from ..showing import AbstractShown
 from ._base import Fit
 from .deviations import optimum_of
@@ -73,7 +74,7 @@ class Bootstrap(AbstractShown):
         return f"{len(self.theta)} draws, {int(self.settled.sum())} settled"
 
 
-def bootstrap(fit: Fit, draws: int = 200, *, seed: int = 0) -> Bootstrap:
+def bootstrap(fit: Fit, draws: int = 200, *, seed: int = 0, progress: bool = True) -> Bootstrap:
     """Fits recordings that the fitted model would have given under noise drawn anew, vmapped.
 
     Noise comes from the fit's filters, stationary and stable; a fit by `OEM`, which has none, gets
@@ -85,7 +86,7 @@ def bootstrap(fit: Fit, draws: int = 200, *, seed: int = 0) -> Bootstrap:
 
     - `fit`: by `OEM`, `SeparablePEM` or `JointPEM`.
     - `draws`: how many.
-    - `seed`: of the noise.
+    - `seed`: of the noise. `progress`: show a line on the terminal while it works.
 
     **Raises:** `FitError` for a fit by regression, with `Tracking()`, or that did not succeed.
     """
@@ -99,7 +100,8 @@ def bootstrap(fit: Fit, draws: int = 200, *, seed: int = 0) -> Bootstrap:
     if len(lengths) != problem.batch.q.shape[0]:
         raise FitError("bootstrap is for whole recordings: fit without window")
     made = drawn_noise(noise, lengths, draws, np.random.default_rng(seed))
-    found = refit_signals(fit, redrawn(fit, made))
+    with working(f"bootstrap of {fit.loop.name}", progress) as say:
+        found = refit_signals(fit, redrawn(fit, made), say=say)
     p = len(fit.names)
     # The last step of a hundredth is squared: a tenth of a deviation.
     return Bootstrap(fit, np.asarray(found.theta)[:, :p], np.asarray(found.last) < 1e-2)

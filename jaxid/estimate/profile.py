@@ -13,6 +13,7 @@ from scipy import interpolate, optimize, stats
 
 from .. import figures
 from ..errors import FitError
+from ..progress import working
 from ..showing import AbstractShown
 from ._base import Fit
 from .deviations import Reduced, covariance_of, optimum_of
@@ -79,7 +80,7 @@ class Profile(AbstractShown):
         return head + table.to_html(float_format=lambda x: f"{x:.4g}")
 
 
-def profile(fit: Fit, *names: str) -> dict[str, Profile]:
+def profile(fit: Fit, *names: str, progress: bool = True) -> dict[str, Profile]:
     """Likelihood profiles, all points of all of them fitted at once, vmapped.
 
     Where a fit shows sandwich deviations its error is not taken for white, and the deviance is
@@ -89,6 +90,7 @@ def profile(fit: Fit, *names: str) -> dict[str, Profile]:
 
     - `fit`: by `OEM`, `SeparablePEM` or `JointPEM`; the noise filters of the former two are kept.
     - `names`: of parameters; all of them by default.
+    - `progress`: show a line on the terminal while it works.
 
     **Raises:** `FitError` for a fit by regression, or a parameter that it does not determine.
     """
@@ -118,7 +120,8 @@ def profile(fit: Fit, *names: str) -> dict[str, Profile]:
         upper=jnp.asarray(held_high),
         theta=jnp.asarray(start),
     )
-    found = refit(optimum, lanes)
+    with working(f"profile of {fit.loop.name}", progress) as say:
+        found = refit(optimum, lanes, say=say)
     loss, ended = np.asarray(found.loss), np.asarray(found.theta)[:, : len(theta)]
     base, variance = _loss_and_variance(optimum)
     profiles, row = {}, 0

@@ -1,7 +1,7 @@
 """Many fits at once, from values close by: what bootstrap, profiles and coverage are made of."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from ..errors import FitError
 from ..lapack import solve
 from ..noise import ARFilter, VectorAR, fit_ar
+from ..progress import silent
 from ._base import Fit
 from ._least_squares import (
     Point,
@@ -207,7 +208,9 @@ def _refit_some(optimum: Optimum, lanes: Lanes, steps: int) -> Refitted:
     return jax.vmap(one)(lanes)
 
 
-def refit(optimum: Optimum, lanes: Lanes, steps: int = 4) -> Refitted:
+def refit(
+    optimum: Optimum, lanes: Lanes, steps: int = 4, say: Callable[..., None] = silent
+) -> Refitted:
     """Fits of a problem with other signals, filters, bounds or start values, vmapped.
 
     Gauss-Newton with weights kept: some steps with the sensitivities of the problem's own values,
@@ -218,9 +221,11 @@ def refit(optimum: Optimum, lanes: Lanes, steps: int = 4) -> Refitted:
 
     - `optimum`: of a fit; its values and initial states are where sensitivities are taken.
     - `steps`: how many before the last.
+    - `say`: told how far it is.
     """
     count, pieces = lanes.theta.shape[0], []
     for begin in range(0, count, LANES):
+        say(f"{begin} of {count} fits", begin / count)
         # Always as many, the last ones again where they run out: one program serves all counts.
         rows = np.minimum(np.arange(begin, begin + LANES), count - 1)
         some = jax.tree.map(lambda x, rows=rows: x[rows], lanes)
@@ -256,7 +261,10 @@ def redrawn(
 
 
 def refit_signals(
-    fit: Fit, measured: Float[np.ndarray, "draws recordings samples outputs"], steps: int = 4
+    fit: Fit,
+    measured: Float[np.ndarray, "draws recordings samples outputs"],
+    steps: int = 4,
+    say: Callable[..., None] = silent,
 ) -> Refitted:
     """Fits of other signals by the method of a fit.
 
@@ -267,18 +275,19 @@ def refit_signals(
     **Arguments:**
 
     - `measured`: outputs, padded to the longest recording.
+    - `steps`, `say`: as in `refit`.
     """
     optimum = optimum_of(fit, "draws")
     problem = optimum.problem
     lanes = Lanes.around(optimum, len(measured), measured)
     separable = problem.coefficients is None and fit.rounds > 0
     if not separable or not isinstance(fit.noise, tuple):
-        return refit(optimum, lanes, steps)
+        return refit(optimum, lanes, steps, say)
     white = jnp.zeros_like(lanes.noise).at[..., 0].set(1.0)
-    first = refit(optimum, dataclasses.replace(lanes, noise=white), steps)
+    first = refit(optimum, dataclasses.replace(lanes, noise=white), steps, say)
     taps = _taps_by_draw(np.asarray(first.raw), problem, fit.noise)
     again = dataclasses.replace(lanes, noise=jnp.asarray(taps), theta=jnp.asarray(first.theta))
-    return refit(optimum, again, steps)
+    return refit(optimum, again, steps, say)
 
 
 def _taps_by_draw(
