@@ -251,6 +251,36 @@ def test_rival_with_less_takes_the_place_of_an_early_effect(offset_case, offset_
     assert _rivals(dataclasses.replace(left[1], contenders=contenders[::-1])) == []
 
 
+@pytest.mark.xdist_group("offset")
+def test_transmission_that_alone_does_better_begins_afresh(offset_case, offset_story, monkeypatch):
+    search, steps = search_of(offset_case), offset_story[0].steps
+    value = {"good": 5.0, "poor": 12.0}
+    found = [
+        Contender(name, 1, dataclasses.replace(steps[0].fit, notes=(word,)), 0.0)
+        for name, word in (("joint_elasticity", "poor"), ("backlash", "good"))
+    ]
+    tried = []
+
+    def refit(self, last, leading, say):
+        tried.extend(v.key for v in leading)
+        return found
+
+    def grown(self, last, contenders, say):
+        return dataclasses.replace(last, contenders=tuple(contenders))
+
+    monkeypatch.setattr(_Search, "refit", refit)
+    monkeypatch.setattr(_Search, "grown", grown)
+    monkeypatch.setattr(
+        _Search, "criterion", lambda self, fit, _: value.get("".join(fit.notes[-1:]), 10.0)
+    )
+    assert search.afresh(steps, silent).contenders == (found[1],)
+    # All of them, from the starting model.
+    kinds = ("joint_elasticity", "backlash")
+    assert sorted(tried) == sorted((kind, joint) for kind in kinds for joint in (1, 2))
+    value["good"] = 11.0
+    assert search.afresh(steps, silent) is None
+
+
 def test_contact_is_released_from_several_stiffnesses():
     loop = jaxid.scara().add(Backlash(joint=2, gap=0.01, stiffness=200.0, damping=2.0))
     released = _released(loop, ("kc2", "dk2"))

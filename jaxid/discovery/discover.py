@@ -72,13 +72,21 @@ def discover(
         working(f"discovery on {loop.name}", progress) as say,
         Campaign(resume, plan, classes_of(loop) | _classes_in(search.catalogue)) as campaign,
     ):
-        steps = [campaign.piece("start", lambda: search.begin(loop, say))]
-        verdict: Outcome | None = None
-        while verdict is None:
-            verdict, more = campaign.piece(
-                f"turn {len(steps)}", lambda: search.turn(steps, most, say)
-            )
-            steps.extend(more)
+
+        def follow(steps: list[Step], name: str) -> tuple[Outcome, list[Step]]:
+            verdict: Outcome | None = None
+            while verdict is None:
+                verdict, more = campaign.piece(
+                    f"{name} {len(steps)}", lambda: search.turn(steps, most, say)
+                )
+                steps.extend(more)
+            return verdict, steps
+
+        verdict, steps = follow([campaign.piece("start", lambda: search.begin(loop, say))], "turn")
+        if verdict == "outside_catalogue" and len(steps) > 1:
+            parted = campaign.piece("afresh", lambda: search.afresh(steps, say))
+            if parted is not None:
+                verdict, steps = follow([steps[0], parted], "afresh")
         steps, removed = search.prune(steps, say)
         notes = _notes(steps, most)
         if search.is_series(steps, say):
@@ -237,6 +245,25 @@ class _Search(eqx.Module):
             return ()
         return self.detour(steps, contenders, say, 1, share)
 
+    def afresh(self, steps: Sequence[Step], say: Callable[[str], None]) -> Step | None:
+        """A first step by a transmission that alone does better than all the steps; None if none.
+
+        A drive and a link that come apart look, at a small setting, like friction, or like a lag,
+        and what was added for that hides them from every later screening.
+        """
+        first, last = steps[0], steps[-1]
+        apart = [
+            v
+            for v in first.diagnosis.ranking
+            if isinstance(v.hypothesis.effect, AbstractTransmission)
+        ]
+        contenders = self.refit(first, apart, say)
+        noise = last.diagnosis.noise
+        better = [
+            c for c in contenders if self.criterion(c.fit, noise) < self.criterion(last.fit, noise)
+        ]
+        return self.grown(first, better, say) if better else None
+
     def matters(self, steps: Sequence[Step], share: float = 1e-3) -> Callable[[Verdict], bool]:
         """Whether something is significant, and more than what the steps so far leave of rounding.
 
@@ -356,7 +383,8 @@ class _Search(eqx.Module):
 
         Less is better; a difference of ten is decisive. Infinite where the fit runs away.
         """
-        value = _fitted_criterion(found, noise) + self.unseen_error(found, noise)
+        with np.errstate(over="ignore", invalid="ignore"):
+            value = _fitted_criterion(found, noise) + self.unseen_error(found, noise)
         return value if np.isfinite(value) else np.inf
 
     def unseen_error(self, found: Fit, noise: Sequence[ARFilter]) -> float:

@@ -209,10 +209,12 @@ def relative_errors(
     residuals: Sequence[Float[np.ndarray, "_samples joints"]],
 ) -> pd.DataFrame:
     """100 · ‖residual‖ / ‖measured‖ by recording and joint (Table 3 of Brunot et al. 2016)."""
-    rows = [
-        100 * np.linalg.norm(e, axis=0) / np.linalg.norm(m, axis=0)
-        for m, e in zip(measured, residuals, strict=True)
-    ]
+    # Of a loop that runs away the error is infinite, which is no cause for a warning.
+    with np.errstate(over="ignore"):
+        rows = [
+            100 * np.linalg.norm(e, axis=0) / np.linalg.norm(m, axis=0)
+            for m, e in zip(measured, residuals, strict=True)
+        ]
     names = pd.Index([r.name for r in recordings], name="recording")
     return pd.DataFrame(rows, index=names, columns=joint_columns(measured[0].shape[1]))
 
