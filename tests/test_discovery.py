@@ -232,8 +232,20 @@ def test_superfluous_effect_is_taken_out_and_a_needed_one_stays(offset_case, off
 
 
 @pytest.mark.xdist_group("offset")
-def test_rival_with_less_takes_the_place_of_an_early_effect(offset_case, offset_story):
+def test_rival_with_less_takes_the_place_of_an_early_effect(offset_case, offset_story, monkeypatch):
     search, start = search_of(offset_case), offset_story[0].steps[0]
+
+    def step(self, label, found, **extra):
+        return dataclasses.replace(start, label=label, fit=found, **extra)
+
+    def grown(self, last, contenders, say):
+        best = contenders[0]
+        added = best.fit.loop.effects[-1]
+        return step(self, "+", best.fit, added=added, contenders=tuple(contenders))
+
+    # Which effect goes and which comes is asked here, and a diagnosis of each takes long.
+    monkeypatch.setattr(_Search, "step", step)
+    monkeypatch.setattr(_Search, "grown", grown)
     spring, drag = Spring(joint=2), QuadraticDrag(joint=1)
     steps = with_chain(search, start, spring, drag)
     fits = steps[1].fit, with_chain(search, start, TorqueOffset(joint=2))[1].fit
