@@ -259,9 +259,8 @@ class _Search(eqx.Module):
         ]
         contenders = self.refit(first, apart, say)
         noise = last.diagnosis.noise
-        better = [
-            c for c in contenders if self.criterion(c.fit, noise) < self.criterion(last.fit, noise)
-        ]
+        kept = self.criterion(last.fit, noise)
+        better = [c for c in contenders if self.criterion(c.fit, noise) < kept]
         return self.grown(first, better, say) if better else None
 
     def matters(self, steps: Sequence[Step], share: float = 1e-3) -> Callable[[Verdict], bool]:
