@@ -55,7 +55,9 @@ def unrolled(fun: Callable[..., Any], *like: Any) -> Callable[..., Any]:
         outputs = _Writer().run(closed.jaxpr, consts, inputs)
         return jax.tree.unflatten(structure, [value.whole() for value in outputs])
 
-    return evaluate
+    # As a part of its own: the stages of a step share one trace of it, batched and differentiated
+    # once. XLA inlines them.
+    return jax.jit(evaluate)
 
 
 class _Value:

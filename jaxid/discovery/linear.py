@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..effects import AbstractTransmission, Motion
 from ..loop import ClosedLoop
-from ..simulate import SIGNALS, Batch, Interval, advance, initial, run
+from ..simulate import SIGNALS, Batch, Interval, advance, each, initial, run
 
 Place = Literal["push", "noise", "pull"]
 
@@ -80,7 +80,7 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
         )
         return a, b, c, d, start, motion, seen
 
-    return Linearised(*jax.vmap(whole)(batch.intervals, batch.q0, batch.v0), places)
+    return Linearised(*each(whole, batch.intervals, batch.q0, batch.v0), places=places)
 
 
 @eqx.filter_jit
@@ -106,7 +106,7 @@ def base_columns(
         direct = jnp.pad(d[..., :parameters], ((0, 0), (0, 0), (0, extra)))
         return c @ history + direct
 
-    return jax.vmap(one)(linear.A, linear.B, linear.C, linear.D, linear.start)
+    return each(one, linear.A, linear.B, linear.C, linear.D, linear.start)
 
 
 @eqx.filter_jit
@@ -148,4 +148,4 @@ def respond(
         matrices = (x.astype(values.dtype) for x in (a, b[..., inputs], c, d[..., inputs]))
         return jax.lax.scan(body, (s, values[0]), (*matrices, after))[1]
 
-    return jax.vmap(one)(linear.A, linear.B, linear.C, linear.D, linear.start, values)
+    return each(one, linear.A, linear.B, linear.C, linear.D, linear.start, values)

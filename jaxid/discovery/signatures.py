@@ -16,7 +16,7 @@ from ..errors import ModelError
 from ..loop import ClosedLoop, effect_loads
 from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..recording import Recordings
-from ..simulate import Batch, initial, run
+from ..simulate import Batch, each, initial, run
 from .linear import Linearised, respond
 
 
@@ -254,7 +254,7 @@ def _finite(
         return run(grown, intervals, initial(grown, intervals, q0, v0))[1][:, row]
 
     def setting(effect):
-        return jax.vmap(lambda i, q, v: one(effect, i, q, v))(batch.intervals, batch.q0, batch.v0)
+        return each(lambda i, q, v: one(effect, i, q, v), batch.intervals, batch.q0, batch.v0)
 
     return jnp.moveaxis(eqx.filter_vmap(setting, in_axes=eqx.if_array(0))(stacked), 0, -1)
 
