@@ -25,8 +25,8 @@ class Interval(eqx.Module):
     """What drives the loop from one grid point to the next; the last interval has no length.
 
     `reference` holds the coefficients of the interval's cubic, `torque` those of a line; `noise`
-    is added to what the sensors read, `push` and `pull` to the torque on drives and links, each
-    given at both ends and joined by a line, or None.
+    and `rate` are added to the position and velocity that the sensors read, `push` and `pull` to
+    the torque on drives and links, each given at both ends and joined by a line, or None.
     """
 
     t0: Float[Array, ""]
@@ -36,6 +36,7 @@ class Interval(eqx.Module):
     reference: Float[Array, "4 joints"]
     torque: Float[Array, "2 joints"]
     noise: Float[Array, "2 joints"] | None = None
+    rate: Float[Array, "2 joints"] | None = None
     push: Float[Array, "2 joints"] | None = None
     pull: Float[Array, "2 joints"] | None = None
 
@@ -135,10 +136,11 @@ def _drive(
     def padded(values: np.ndarray) -> np.ndarray:
         return np.concatenate([values, np.repeat(values[-1:], pad, axis=0)])
 
-    ends = None
+    ends = rate = None
     if noise is not None:
-        at_points = padded(_pieces(recording.time, noise, grid, "linear", 1)[:, 0])
-        ends = np.stack([at_points, np.append(at_points[1:], at_points[-1:], axis=0)], axis=1)
+        lines = padded(_pieces(recording.time, noise, grid, "linear", 1))
+        ends = np.stack([lines[:, 0], np.append(lines[1:, 0], lines[-1:, 0], axis=0)], axis=1)
+        rate = np.stack([lines[:, 1], lines[:, 1]], axis=1)
     return (
         padded(grid),
         np.append(np.diff(grid), np.zeros(pad + 1)),
@@ -147,6 +149,7 @@ def _drive(
         padded(_pieces(recording.time, signals.q, grid, kind, 3)),
         padded(_pieces(recording.time, signals.tau, grid, "linear", 1)),
         ends,
+        rate,
     )
 
 
@@ -263,12 +266,11 @@ def compared(
 # --- one interval -------------------------------------------------------------------------------
 
 
-def _line(ends: Float[Array, "2 joints"] | None, dt, h, joints: int) -> Reading:
-    """Value and slope of a line between its two ends."""
+def _line(ends: Float[Array, "2 joints"] | None, dt, h, joints: int) -> Float[Array, " joints"]:
+    """A line between its two ends, after a time from the first."""
     if ends is None:
-        return Reading(jnp.zeros(joints), jnp.zeros(joints))
-    slope = (ends[1] - ends[0]) / jnp.where(h > 0, h, 1.0)
-    return Reading(ends[0] + dt * slope, slope)
+        return jnp.zeros(joints)
+    return ends[0] + dt * (ends[1] - ends[0]) / jnp.where(h > 0, h, 1.0)
 
 
 def _reference(interval: Interval, dt: Float[Array, ""]) -> Reference:
@@ -281,11 +283,11 @@ def _reference(interval: Interval, dt: Float[Array, ""]) -> Reference:
 
 def _instant_at(loop: ClosedLoop, interval: Interval, t: Float[Array, ""], state: State) -> Instant:
     dt = t - interval.t0
-    noise, push, pull = (
+    noise, rate, push, pull = (
         _line(ends, dt, interval.h, loop.joints)
-        for ends in (interval.noise, interval.push, interval.pull)
+        for ends in (interval.noise, interval.rate, interval.push, interval.pull)
     )
-    outside = Outside(push.q, pull.q, noise)
+    outside = Outside(push, pull, Reading(noise, rate))
     return instant(loop, t, state, _reference(interval, dt), outside, interval.label)
 
 

@@ -7,7 +7,14 @@ import pytest
 import jaxid
 from jaxid.discovery.linear import linearise
 from jaxid.discovery.signatures import signatures
-from jaxid.effects import Gravity, JointElasticity, Spring, Stribeck, TorqueOffset
+from jaxid.effects import (
+    EncoderEccentricity,
+    Gravity,
+    JointElasticity,
+    Spring,
+    Stribeck,
+    TorqueOffset,
+)
 from jaxid.simulate import prepare, set_substeps
 
 LINES = sim.MultiSine(
@@ -21,6 +28,7 @@ PAIRS = {
     "stribeck": (Stribeck(2, 0.0, 0.3), Stribeck(2, SMALL, 0.3)),
     "spring": (Spring(1), Spring(1, 0.0, SMALL)),
     "gravity": (Gravity(), Gravity((SMALL, 0.0))),
+    "eccentricity": (EncoderEccentricity(2), EncoderEccentricity(2, SMALL)),
 }
 
 

@@ -12,17 +12,17 @@ from ..effects import AbstractTransmission, Motion
 from ..loop import ClosedLoop
 from ..simulate import SIGNALS, Batch, Interval, advance, each, initial, run
 
-Place = Literal["push", "noise", "pull"]
+Place = Literal["push", "noise", "rate", "pull"]
 
 
 class Linearised(eqx.Module):
     """Exact derivatives of every interval along the runs of a batch.
 
     With x' = A x + B u and y = C x + D u, where u holds the free parameters, then each of `places`
-    at both ends of an interval: torque on the drives (`push`), what is added to the sensors
-    (`noise`), and torque on the links (`pull`) where transmissions part them from the drives. Each
-    leaf has `(recordings, points)` first. `motion` is the nominal one, `seen` the signals of
-    `SIGNALS`.
+    at both ends of an interval: torque on the drives (`push`), what is added to the positions
+    (`noise`) and velocities (`rate`) that the sensors read, and torque on the links (`pull`) where
+    transmissions part them from the drives. Each leaf has `(recordings, points)` first. `motion` is
+    the nominal one, `seen` the signals of `SIGNALS`.
     """
 
     A: Float[Array, "recordings points states states"]
@@ -46,7 +46,7 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     n, theta, row = loop.joints, loop.theta, SIGNALS.index(output)
     p = theta.shape[0]
     parted = any(isinstance(effect, AbstractTransmission) for effect in loop.effects)
-    places: tuple[Place, ...] = ("push", "noise", "pull") if parted else ("push", "noise")
+    places: tuple[Place, ...] = ("push", "noise", "rate", *(("pull",) if parted else ()))
     ends = jnp.zeros((2 * len(places), n))
 
     def one(u, interval, x):
@@ -120,7 +120,7 @@ def respond(
     **Arguments:**
 
     - `place`: one of `linear.places`.
-    - `values`: one column a hypothesis, N·m or N, rad or m.
+    - `values`: one column a hypothesis: N·m or N; rad or m; rad/s or m/s.
     """
 
     joints, last = values.shape[2], linear.B.shape[-1]
@@ -138,13 +138,12 @@ def respond(
             u = jnp.concatenate([now, then])
             return (times(a, s) + times(b, u), then), times(c, s) + times(d, u)
 
-        # Beyond the last point the line goes on, so that its slope, a velocity, stays what it is.
-        beyond = 2 * values[-1:] - values[-2:-1]
-        after = jnp.concatenate([values[1:], beyond])
+        after = jnp.concatenate([values[1:], values[-1:]])
         s = jnp.zeros((a.shape[-1], values.shape[-1]), values.dtype)
-        if place == "noise":
-            # A run starts where the sensors said that it does.
-            s = -times(start[:, :joints].astype(values.dtype), values[0])
+        if place in ("noise", "rate"):
+            # A run starts where, and as fast as, the sensors said that it does.
+            of = start[:, :joints] if place == "noise" else start[:, joints:]
+            s = -times(of.astype(values.dtype), values[0])
         matrices = (x.astype(values.dtype) for x in (a, b[..., inputs], c, d[..., inputs]))
         return jax.lax.scan(body, (s, values[0]), (*matrices, after))[1]
 

@@ -169,27 +169,32 @@ def _settled_states(effect: AbstractEffect, motion: Motion) -> Float[Array, "poi
     return jax.lax.scan(body, start, (motion, following))[1]
 
 
-def _forces(
-    effect: AbstractEffect, motion: Motion, left: Float[Array, "points joints"]
-) -> tuple[Float[Array, "points joints columns"], Float[Array, "points joints columns"]]:
-    """What the effect adds to joint torque and sensor reading along one run, by amplitude."""
+Forces = tuple[
+    Float[Array, "*points joints columns"],
+    Float[Array, "*points joints columns"],
+    Float[Array, "*points joints columns"],
+]
+
+
+def _forces(effect: AbstractEffect, motion: Motion, left: Float[Array, "points joints"]) -> Forces:
+    """What the effect adds to joint torque, position read and velocity read, by amplitude."""
     linear = amplitudes(effect)
     states = _settled_states(effect, motion)
 
-    def along(values: Float[Array, " columns"], absent: bool = False):
+    def along(values: Float[Array, " columns"]):
         here = write_values(effect, linear, values) if linear else effect
 
         def one(at: Motion, state, rest):
             at = eqx.tree_at(lambda m: m.state, at, state)
             loaded = eqx.tree_at(lambda m: m.tau, at, rest) if effect.loaded else at
-            return here.command(at) - at.tau - here.torque(loaded), here.read(at.q) - at.q
+            q, v = jax.jvp(here.read, (at.q,), (at.v,))
+            return here.command(at) - at.tau - here.torque(loaded), q - at.q, v - at.v
 
         return jax.vmap(one)(motion, states, left)
 
     if linear:
         return jax.jacfwd(along)(read_values(effect, linear))
-    push, noise = along(jnp.zeros(0))
-    return push[..., None], noise[..., None]
+    return jax.tree.map(lambda x: x[..., None], along(jnp.zeros(0)))
 
 
 @eqx.filter_jit
@@ -208,24 +213,23 @@ def _all_forces(
     groups: list[AbstractEffect],
     motion: Motion,
     left: Float[Array, "recordings points joints"],
-) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+) -> Forces:
     """Forces of all hypotheses: one trace for each structure, `vmap` over its settings.
 
     It does not know the loop, so that it is compiled once however the model grows.
     """
 
-    def of_run(run: Motion, left):
-        pushes, noises = [], []
+    def of_run(run: Motion, left) -> Forces:
+        made = []
         for stacked in groups:
-            push, noise = eqx.filter_vmap(
+            forces = eqx.filter_vmap(
                 lambda effect: _forces(effect, run, left), in_axes=eqx.if_array(0)
             )(stacked)
             # (settings, points, joints, columns) to (points, joints, settings · columns)
-            shape = (*push.shape[1:3], -1)
-            pushes.append(jnp.moveaxis(push, 0, 2).reshape(shape))
-            noises.append(jnp.moveaxis(noise, 0, 2).reshape(shape))
-        push, noise = jnp.concatenate(pushes, axis=-1), jnp.concatenate(noises, axis=-1)
-        return push.astype(jnp.float32), noise.astype(jnp.float32)
+            made.append(
+                jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2).reshape(*x.shape[1:3], -1), forces)
+            )
+        return jax.tree.map(lambda *x: jnp.concatenate(x, -1).astype(jnp.float32), *made)
 
     return jax.vmap(of_run)(motion, left)
 
@@ -279,11 +283,12 @@ def signatures(
     if groups:
         say(f"{len(direct)} signatures by linear response")
         left = _left_for_links(loop, linear.motion)
-        push, noise = _all_forces([stacked for stacked, _ in groups], linear.motion, left)
+        push, noise, rate = _all_forces([stacked for stacked, _ in groups], linear.motion, left)
         table = np.array(respond(linear, "push", push))
         reading = np.flatnonzero(np.asarray(jnp.any(noise != 0, axis=(0, 1, 2))))
         if len(reading):
             table[..., reading] += respond(linear, "noise", noise[..., reading])
+            table[..., reading] += respond(linear, "rate", rate[..., reading])
         for _, places in groups:
             low, high = _amplitude_bounds(proposed[direct[places[0]]][0])
             for place in places:
