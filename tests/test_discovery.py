@@ -1,6 +1,7 @@
 """What is missing is found, on recordings of a simulator that shares no code with jaxid."""
 
 import dataclasses
+import sys
 
 import equinox as eqx
 import independent as sim
@@ -305,6 +306,27 @@ def test_contact_is_released_from_several_stiffnesses():
         (200.0, 4.0),
     ]
     assert _released(loop, ()) == []
+
+
+@pytest.mark.xdist_group("offset")
+def test_contact_is_free_from_the_start_in_some_refits(offset_case, offset_story, monkeypatch):
+    search, start = search_of(offset_case), offset_story[0].steps[0]
+    plain = []
+
+    def fit(loop, recordings, method):
+        plain.append(method)
+        return dataclasses.replace(start.fit, loop=loop)
+
+    monkeypatch.setattr(sys.modules["jaxid.discovery.discover"], "fit", fit)
+    of = {v.key: v for v in start.diagnosis.ranking}
+    screened = of["backlash", 2].hypothesis.effect
+    loops = search.starts(start, of["backlash", 2])
+    gaps = [float(loop.effects[-1].gap / screened.gap) for loop in loops]
+    assert gaps[1:] == pytest.approx([1.0, 1.0, 10.0])
+    assert ["kc2" in loop.names for loop in loops] == [False, False, True, True]
+    # Without noise filters, which knew nothing of a gap.
+    assert [type(method) for method in plain] == [jaxid.OEM, jaxid.OEM]
+    assert len(search.starts(start, of["spring", 2])) == 1
 
 
 @pytest.mark.xdist_group("offset")

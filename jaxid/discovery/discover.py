@@ -336,19 +336,40 @@ class _Search(eqx.Module):
         for k, verdict in enumerate(leading):
             called = effect_on(*verdict.key)
             say(f"refit with {called}, {k + 1} of {len(leading)}", k / len(leading))
-            # What was screened at a finite setting may start in another valley at its prediction.
-            starts = [last.diagnosis.predicted(verdict)]
-            if not amplitudes(verdict.hypothesis.effect):
-                starts.append(verdict.hypothesis.effect)
             tried = []
-            for effect in starts:
-                loop = last.fit.loop.add(_inside(effect))
+            for loop in self.starts(last, verdict):
                 refitted = fit(loop, self.recordings, self.whitened_method(last.diagnosis))
                 value = self.criterion(refitted, last.diagnosis.noise)
                 if np.isfinite(value):
                     tried.append(Contender(*verdict.key, refitted, value))
             found += sorted(tried, key=_criterion)[:1]
         return sorted(found, key=_criterion)
+
+    def starts(self, last: Step, verdict: Verdict, wide: float = 10.0) -> list[ClosedLoop]:
+        """Where refits with an effect begin: at its prediction; from several where that is far off.
+
+        What was screened at a finite setting may start in another valley at its prediction. And
+        between a drive and a link that come apart nearly every valley is a wrong one while the
+        contact's stiffness is held at a wrong value; with that free from the start, and from a gap
+        that is too wide, where the link flies longest and all parameters show, few are. Noise
+        filters that knew nothing of it would hide just that, so those refits begin without.
+        """
+
+        def grown(effect: AbstractEffect) -> ClosedLoop:
+            return last.fit.loop.add(_inside(effect))
+
+        effect, found = verdict.hypothesis.effect, [grown(last.diagnosis.predicted(verdict))]
+        if amplitudes(effect):
+            return found
+        found.append(grown(effect))
+        held = _held_shapes(found[0])
+        if held:
+            plain = dataclasses.replace(_quiet(self.method), start="given")
+            found += [
+                fit(grown(effect.scaled(factor)).free(*held), self.recordings, plain).loop
+                for factor in (1.0, wide)
+            ]
+        return found
 
     def settled(self, best: Contender, say: Callable[[str], None]) -> Contender:
         """The best contender with noise filters of its own, and its held shapes if they matter.
@@ -360,8 +381,9 @@ class _Search(eqx.Module):
         """
         loop = best.fit.loop
         held = () if amplitudes(loop.effects[-1]) else _held_shapes(loop)
+        released = _released(loop, [name for name in held if name not in loop.names])
         found = [best.fit]
-        for start in (loop, *_released(loop, held)):
+        for start in (loop, *released):
             say(f"refit of {effect_on(best.name, best.joint)} with its own noise")
             found.append(fit(start, self.recordings, self.alternating()))
         chosen = min((f for f in found if f.succeeded), key=_bic, default=best.fit)
