@@ -349,7 +349,7 @@ class _Search(eqx.Module):
         """Where refits with an effect begin: at its prediction; from several where that is far off.
 
         What was screened at a finite setting may start in another valley at its prediction. And
-        between a drive and a link that come apart nearly every valley is a wrong one while the
+        where drive and link part and meet again nearly every valley is a wrong one while the
         contact's stiffness is held at a wrong value; with that free from the start, and from a gap
         that is too wide, where the link flies longest and all parameters show, few are. Noise
         filters that knew nothing of it would hide just that, so those refits begin without.
@@ -362,8 +362,8 @@ class _Search(eqx.Module):
         if amplitudes(effect):
             return found
         found.append(grown(effect))
-        held = _held_shapes(found[0])
-        if held:
+        if effect.contact:
+            held = _held_shapes(found[0])
             plain = dataclasses.replace(_quiet(self.method), start="given")
             found += [
                 fit(grown(effect.scaled(factor)).free(*held), self.recordings, plain).loop

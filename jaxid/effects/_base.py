@@ -46,6 +46,8 @@ class AbstractEffect(eqx.Module):
     - `finite`: it has no derivative at nothing, or one that says little of what it does: screened
       by simulations with it.
     - `on_link`: `torque` acts on the link, beyond what gives way between it and its drive.
+    - `contact`: it parts and meets again, so that a shape held at a wrong value (how stiff it is)
+      leaves a fit in a wrong valley.
     """
 
     inertial: ClassVar[bool] = False
@@ -53,6 +55,7 @@ class AbstractEffect(eqx.Module):
     loaded: ClassVar[bool] = False
     finite: ClassVar[bool] = False
     on_link: ClassVar[bool] = False
+    contact: ClassVar[bool] = False
 
     @classmethod
     def effect_name(cls) -> str:

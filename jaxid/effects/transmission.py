@@ -71,6 +71,7 @@ class Backlash(AbstractTransmission):
     damping: Scalar = parameter(
         3.0, symbol="dk", unit="s/rad", lower=0.0, scale=1.0, free=False, linear=False
     )
+    contact = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Backlash"]:
