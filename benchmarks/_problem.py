@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxid
-from jaxid.simulate import prepare, set_substeps, simulate
+from jaxid.estimate._least_squares import Problem
+from jaxid.parameters import Bounds
+from jaxid.simulate import Batch, prepare, set_substeps, simulate
 
 SUBSTEPS = 4
 PERIOD = 0.01
@@ -64,6 +67,15 @@ def recordings(count: int, seconds: float, seed: int = 0) -> jaxid.Recordings:
             for r, run in zip(bare, runs, strict=True)
         ]
     )
+
+
+def problem(loop: jaxid.ClosedLoop, batch: Batch, mesh: jax.sharding.Mesh | None = None) -> Problem:
+    """What `OEM` minimises in it, with white noise and starts at rest."""
+    bounds, count = Bounds.of(loop.free_parameters), batch.q0.shape[0]
+    white = jnp.zeros((2, 16)).at[:, 0].set(1.0)
+    ends = bounds.lower, bounds.upper
+    kinds = ("tau",), False, mesh
+    return Problem(loop, batch, jnp.ones(2), white, jnp.zeros(count), *ends, *kinds)
 
 
 def arrays(recs: jaxid.Recordings) -> list[dict[str, np.ndarray]]:

@@ -10,6 +10,8 @@ python -m benchmarks.peers [--quick] [--json FILE]
 """
 
 import ctypes
+import dataclasses
+import functools
 import shutil
 import subprocess
 import tempfile
@@ -25,11 +27,22 @@ import pandas as pd
 from scipy import integrate, optimize
 
 import jaxid
-from jaxid.estimate._least_squares import sensitivity
+from jaxid.estimate._least_squares import linearisation, point_around
 from jaxid.simulate import each, initial, prepare, run
 
 from ._output import options, report
-from ._problem import NOISE, SUBSTEPS, TRUTH, arrays, cad, interleaved, machine, once, recordings
+from ._problem import (
+    NOISE,
+    SUBSTEPS,
+    TRUTH,
+    arrays,
+    cad,
+    interleaved,
+    machine,
+    once,
+    problem,
+    recordings,
+)
 
 KP, KV, KG = np.array([6.25, 156.25]), np.array([2.0, 25.0]), np.array([3.5, 0.06])
 GAMMA, LENGTH, P = 100.0, 0.5, 8
@@ -48,13 +61,18 @@ class Peer:
         self.name, self.simulate, self.jacobian, self.cold = name, simulate, jacobian, cold
 
 
-def of_jaxid(recs: jaxid.Recordings) -> Peer:
-    """jaxid's own: what a fit calls."""
+def of_jaxid(recs: jaxid.Recordings, alone: bool = False) -> Peer:
+    """What a fit of jaxid repeats: weighted residual, Jacobian and normal equations.
+
+    On all cores, which share recordings, or on one alone.
+    """
     started = time.perf_counter()
     loop = cad()
     batch = prepare(loop, recs)
-    white = jnp.zeros((2, 16)).at[:, 0].set(1.0)
-    ones = jnp.ones(2)
+    # Simulated less measured, so that its derivative is the torque's.
+    asked = dataclasses.replace(problem(loop, batch), weights=-jnp.ones(2))
+    start = jnp.concatenate([batch.q0, batch.v0], axis=1)
+    around = functools.partial(point_around, asked) if alone else linearisation(asked)
 
     @jax.jit
     def simulate(theta):
@@ -65,13 +83,13 @@ def of_jaxid(recs: jaxid.Recordings) -> Peer:
 
         return each(one, batch.intervals, batch.q0, batch.v0)
 
-    @jax.jit
     def jacobian(theta):
-        found = sensitivity(loop.with_theta(theta), batch, ones, white, ("tau",), False)
-        return batch.tau - found.raw, -found.jacobian
+        found = around(jnp.asarray(theta), start).found
+        return found.raw, found.jacobian
 
     once(lambda: jacobian(np.asarray(loop.theta)))
-    return Peer("jaxid", simulate, jacobian, time.perf_counter() - started)
+    name = "jaxid, one core" if alone else "jaxid"
+    return Peer(name, simulate, jacobian, time.perf_counter() - started)
 
 
 def of_c(recs: jaxid.Recordings) -> Peer | None:
@@ -343,7 +361,7 @@ def per_call(seconds: float, many: int, budget: float) -> list[dict[str, Any]]:
     theta, rows = np.array(list(TRUTH.values())), []
     for count in (1, many):
         recs = recordings(count, seconds)
-        peers = [of_jaxid(recs), of_c(recs)]
+        peers = [of_jaxid(recs), of_jaxid(recs, alone=True), of_c(recs)]
         peers += [of_casadi(recs, False), of_casadi(recs, True), of_mujoco(recs)]
         if count == 1:
             peers.append(of_scipy(recs))

@@ -20,21 +20,11 @@ import pandas as pd
 import jaxid
 from jaxid.discovery.linear import linearise as linear_system
 from jaxid.discovery.linear import respond
-from jaxid.estimate._least_squares import Problem, linearise
-from jaxid.parameters import Bounds
+from jaxid.estimate._least_squares import linearisation
 from jaxid.simulate import Batch, prepare
 
 from ._output import options, report
-from ._problem import SUBSTEPS, cad, interleaved, machine, recordings, truth
-
-
-def problem(loop: jaxid.ClosedLoop, batch: Batch, mesh: jax.sharding.Mesh | None = None) -> Problem:
-    """What `OEM` minimises, with white noise and starts at rest."""
-    bounds, count = Bounds.of(loop.free_parameters), batch.q0.shape[0]
-    white = jnp.zeros((2, 16)).at[:, 0].set(1.0)
-    ends = bounds.lower, bounds.upper
-    kinds = ("tau",), False, mesh
-    return Problem(loop, batch, jnp.ones(2), white, jnp.zeros(count), *ends, *kinds)
+from ._problem import SUBSTEPS, cad, interleaved, machine, problem, recordings, truth
 
 
 def grown(parameters: int) -> jaxid.ClosedLoop:
@@ -55,7 +45,8 @@ def calls(cases: dict[tuple, tuple[jaxid.ClosedLoop, Batch]]) -> dict[tuple, Any
     for key, (loop, batch) in cases.items():
         asked, theta = problem(loop, batch), loop.theta
         start = jnp.concatenate([batch.q0, batch.v0], axis=1)
-        made[key] = lambda asked=asked, theta=theta, start=start: linearise(asked, theta, start)
+        around = linearisation(asked)
+        made[key] = lambda around=around, theta=theta, start=start: around(theta, start)
         made[key]()
     return made
 
@@ -136,14 +127,10 @@ def shared(seconds: float, count: int) -> None:
     """Prints the time of a Jacobian that all devices of this process share."""
     batch = repeated(prepare(cad(), recordings(1, seconds)), count)
     mesh = jax.sharding.Mesh(np.array(jax.devices()), ("recordings",))
-    # What the loop's data costs to place is paid once in a fit, but in every call here.
-    from jaxid.estimate._least_squares import _linearise
-    from jaxid.sharding import everywhere
-
-    start = jnp.concatenate([batch.q0, batch.v0], axis=1)
-    placed = everywhere((problem(truth(), batch, mesh), truth().theta, start), mesh)
-    _linearise(*placed)
-    best = interleaved({0: lambda: _linearise(*placed)}, 10.0, most=10)[0]
+    around = linearisation(problem(truth(), batch, mesh))
+    theta, start = truth().theta, jnp.concatenate([batch.q0, batch.v0], axis=1)
+    around(theta, start)
+    best = interleaved({0: lambda: around(theta, start)}, 10.0, most=10)[0]
     print(json.dumps({"ms": 1e3 * best, "us_per_step": 1e6 * best / SUBSTEPS / batch.mask.size}))
 
 

@@ -1,6 +1,8 @@
-"""Work shared out over the devices of a mesh: cores, accelerators, or machines."""
+"""Recordings shared out: over the cores of this machine, or over the devices of a mesh."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import equinox as eqx
@@ -8,9 +10,48 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import PyTree
+from jaxtyping import Int, PyTree
 
+Given = TypeVar("Given")
 Result = TypeVar("Result")
+
+
+def cores() -> int:
+    """How many cores this process may use; one where an accelerator does the work."""
+    if jax.default_backend() != "cpu":
+        return 1
+    known = hasattr(os, "sched_getaffinity")
+    return len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
+
+
+def of_this_machine(mesh: Mesh) -> bool:
+    """Whether a mesh has host devices of this process only: threads by another name."""
+    here = jax.process_index()
+    return all(d.platform == "cpu" and d.process_index == here for d in mesh.devices.flat)
+
+
+def shares_of(count: int, parts: int) -> list[Int[np.ndarray, " rows"]]:
+    """Which recordings each of `parts` takes: as many each, the last again where they run out."""
+    size = -(-count // min(parts, count))
+    return [np.minimum(np.arange(k, k + size), count - 1) for k in range(0, count, size)]
+
+
+def at_once(fun: Callable[[Given], Result], parts: Sequence[Given]) -> list[Result]:
+    """The function of each part, one a thread: XLA runs a loop on the core of its caller."""
+
+    with ThreadPoolExecutor(len(parts)) as pool:
+        return list(pool.map(lambda part: jax.block_until_ready(fun(part)), parts))
+
+
+def taken(each: PyTree, rows: Int[np.ndarray, " rows"]) -> PyTree:
+    """These rows of the leading axis of every leaf."""
+    return jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[rows], each))
+
+
+def end_to_end(parts: Sequence[Result], count: int) -> Result:
+    """The leading axes of all leaves put together again, without what filled up the last part."""
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
+    return jax.device_put(joined)
 
 
 def everywhere(tree: PyTree, mesh: Mesh) -> PyTree:

@@ -204,10 +204,11 @@ def prepare(
     rows = [
         _drive(loop, r, g, length, e) for r, g, e in zip(recordings, grids, noises, strict=True)
     ]
-    fields = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *rows))
-    # Shapes alone are mapped: the values are where they belong already.
-    shapes = jax.eval_shape(jax.vmap(jax.vmap(Interval)), *fields)
-    intervals = jax.tree.unflatten(jax.tree.structure(shapes), jax.tree.leaves(fields))
+    fields = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+    # The structure is that of one interval; the values are where they belong already.
+    one = Interval(*jax.device_put(jax.tree.map(lambda leaf: leaf[0, 0], fields)))
+    leaves = jax.tree.leaves(jax.device_put(fields))
+    intervals = jax.tree.unflatten(jax.tree.structure(one), leaves)
     on_grid = all(len(grid) == r.samples for r, (grid, _) in zip(recordings, grids, strict=True))
     starts = [(r.q[0], np.zeros(loop.joints)) if at_rest(r) else start_of(r) for r in recordings]
     band = band_of(loop, recordings)
@@ -479,16 +480,21 @@ def simulate(
     """
     recordings = Recordings.of(recordings)
     loop = with_substeps(loop, recordings)
-    batch, substeps = prepare(loop, recordings, noise), None
-    if loop.stepping.control is None:
-        # One program for any number of steps: refining them need not compile again.
-        substeps = jnp.asarray(loop.stepping.substeps or 1)
-        loop = set_substeps(loop, None)
-    together = jax.device_get(_simulate(loop, batch, substeps))
+    together = simulate_batch(loop, prepare(loop, recordings, noise))
     return tuple(
         jax.tree.map(lambda leaf, k=k, r=r: leaf[k, : r.samples], together)
         for k, r in enumerate(recordings)
     )
+
+
+def simulate_batch(loop: ClosedLoop, batch: Batch) -> Simulated:
+    """Simulates the loop along a batch; leaves have `(recordings, samples)` first, padded."""
+    substeps = None
+    if loop.stepping.control is None:
+        # One program for any number of steps: refining them need not compile again.
+        substeps = jnp.asarray(loop.stepping.substeps or 1)
+        loop = set_substeps(loop, None)
+    return jax.device_get(_simulate(loop, batch, substeps))
 
 
 def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:

@@ -148,13 +148,13 @@ def test_position_as_output(cases, output):
 
 def test_bounds_hold_in_every_iterate(lacking, monkeypatch):
     seen = []
-    original = ls.linearise
+    original = ls.point_around
 
     def spy(problem, theta, start):
         seen.append((np.asarray(theta), np.asarray(problem.lower), np.asarray(problem.upper)))
         return original(problem, theta, start)
 
-    monkeypatch.setattr(ls, "linearise", spy)
+    monkeypatch.setattr(ls, "point_around", spy)
     fit = jaxid.fit(jaxid.scara(), both(lacking))
     assert len(seen) > 3
     assert all(np.all((low <= x) & (x <= high)) for x, low, high in seen)

@@ -1,5 +1,6 @@
 """Fits that several devices or processes share give the numbers of one."""
 
+import dataclasses
 import json
 import os
 import socket
@@ -7,10 +8,21 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxid
+from jaxid.control import Tracking
+from jaxid.estimate import _least_squares as least_squares
+from jaxid.estimate._least_squares import Problem, linearise, point_around, reweighted
+from jaxid.parameters import Bounds
+from jaxid.simulate import prepare, with_substeps
+
 ROOT = Path(__file__).parents[1]
+DEMO = ROOT / "jaxid" / "demo" / "clean"
+FILES = [DEMO / f"{name}.csv" for name in ("fit_1", "fit_2", "held_out")]
 
 
 def _start(port: int, processes: int, number: int, devices: int = 1) -> subprocess.Popen:
@@ -60,3 +72,37 @@ def test_devices_of_one_host_share_recordings_that_do_not_divide_evenly(alone):
     found = _result(_start(0, 1, 0, devices=2))
     assert found[0] == 2
     _close(found, alone)
+
+
+@pytest.mark.parametrize("law", [None, Tracking()], ids=["own controller", "virtual controller"])
+def test_cores_that_share_recordings_give_the_linearisation_of_one(law, monkeypatch):
+    """Three recordings on two cores: one comes twice, and counts once."""
+    loop, recordings = jaxid.scara(law), jaxid.read(*FILES)
+    problem, theta, start = _problem(loop, recordings)
+    one = point_around(problem, theta, start)
+    monkeypatch.setattr(least_squares, "cores", lambda: 2)
+    shared = linearise(problem, theta, start)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(shared), strict=True):
+        assert a.shape == b.shape
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.max(np.abs(a), initial=0.0))
+
+
+def test_new_weights_need_no_simulation():
+    problem, theta, start = _problem(jaxid.scara(), jaxid.read(*FILES))
+    ratio = jnp.array([2.0, 0.3])
+    other = dataclasses.replace(problem, weights=problem.weights * ratio)
+    expected = point_around(other, theta, start)
+    found = reweighted(other, point_around(problem, theta, start), ratio)
+    for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.max(np.abs(a), initial=0.0))
+
+
+def _problem(loop, recordings):
+    """What OEM minimises, with every initial state free, and where it starts."""
+    loop = with_substeps(loop, recordings)
+    batch = prepare(loop, recordings)
+    bounds = Bounds.of(loop.free_parameters)
+    noise = jnp.zeros((2, 16)).at[:, 0].set(1.0).at[:, 1].set(-0.5)
+    fields = loop, batch, jnp.array([3.0, 7.0]), noise, jnp.ones(3), bounds.lower, bounds.upper
+    start = jnp.concatenate([batch.q0, batch.v0], axis=1)
+    return Problem(*fields, ("tau",), True), loop.theta, start

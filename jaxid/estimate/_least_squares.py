@@ -14,7 +14,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..lapack import column_basis
 from ..loop import ClosedLoop
-from ..sharding import everywhere, shared_out
+from ..sharding import (
+    at_once,
+    cores,
+    end_to_end,
+    everywhere,
+    of_this_machine,
+    shared_out,
+    shares_of,
+    taken,
+)
 from ..simulate import SIGNALS, Batch, each, initial, run, run_with_sensitivities
 from ._base import Status
 
@@ -320,22 +329,73 @@ def linearise(
     theta: Float[Array, " parameters"],
     start: Float[Array, "recordings initials"],
 ) -> Point:
-    """The problem around parameter values and initial states.
+    """The problem around parameter values and initial states, on all cores or over its mesh."""
+    return linearisation(problem)(theta, start)
+
+
+def linearisation(problem: Problem) -> Callable[[Array, Array], Point]:
+    """`linearise` for many sets of values of one problem, which is shared out but once.
 
     With a mesh every process has the whole of it afterwards.
     """
-    if problem.mesh is None:
-        return _linearise(problem, theta, start)
-    point = _linearise(*everywhere((problem, theta, start), problem.mesh))
+    mesh = problem.mesh
+    if mesh is not None and not of_this_machine(mesh):
+        return lambda theta, start: _over_mesh(problem, mesh, theta, start)
+    # Host devices would each compile the program, and take turns to put results together.
+    problem = dataclasses.replace(problem, mesh=None)
+    threads = cores() if mesh is None else mesh.size
+    recordings, samples = problem.batch.mask.shape
+    shares = shares_of(recordings, threads if recordings * samples > _WORTH_SHARING else 1)
+    if len(shares) == 1:
+        return lambda theta, start: point_around(problem, theta, start)
+    parts = [_share(problem, rows) for rows in shares]
+
+    def around(theta: Array, start: Array) -> Point:
+        starts = [taken(start, rows) for rows in shares]
+        given = list(zip(parts, starts, strict=True))
+        points = at_once(lambda one: point_around(one[0], theta, one[1]), given)
+        return _together(points, start)
+
+    return around
+
+
+# Samples in all from which on threads gain more than they cost.
+_WORTH_SHARING = 3000
+
+
+def _over_mesh(problem: Problem, mesh: Mesh, theta: Array, start: Array) -> Point:
+    point = point_around(*everywhere((problem, theta, start), mesh))
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), point)
 
 
+def _share(problem: Problem, rows: Int[np.ndarray, " rows"]) -> Problem:
+    """The problem of some recordings; one that comes again to fill up does not count."""
+    batch, free = taken((problem.batch, problem.free), rows)
+    new = jnp.asarray(np.append(True, np.diff(rows) > 0))[:, None]
+    batch = dataclasses.replace(batch, mask=batch.mask & new)
+    if batch.band is not None:
+        kept = dataclasses.replace(batch.band, keep=batch.band.keep & new)
+        batch = dataclasses.replace(batch, band=kept)
+    return dataclasses.replace(problem, batch=batch, free=free)
+
+
+def _together(points: Sequence[Point], start: Float[Array, "recordings initials"]) -> Point:
+    """The linearisation of all recordings, of those of their shares."""
+    by_recording = [(p.found, p.start_gram, p.start_slope, p.cross) for p in points]
+    found, start_gram, start_slope, cross = end_to_end(by_recording, start.shape[0])
+    sums = [(p.loss, p.gram, p.slope) for p in points]
+    loss, gram, slope = jax.tree.map(lambda *x: jnp.asarray(np.sum(x, axis=0)), *sums)
+    theta = points[0].theta
+    return Point(theta, start, found, loss, gram, slope, start_gram, start_slope, cross)
+
+
 @eqx.filter_jit
-def _linearise(
+def point_around(
     problem: Problem,
     theta: Float[Array, " parameters"],
     start: Float[Array, "recordings initials"],
 ) -> Point:
+    """`linearise` as one compiled function, also for use in others."""
     n, own = problem.loop.joints, problem.loop.theta.shape[0]
     loop = problem.loop.with_theta(theta[:own])
     batch = dataclasses.replace(problem.batch, q0=start[:, :n], v0=start[:, n:])
@@ -374,6 +434,26 @@ def products(
         jnp.einsum("rka,rk->ra", s, r),
         jnp.einsum("rka,rkp->rap", s, j),
     )
+
+
+@eqx.filter_jit
+def reweighted(problem: Problem, point: Point, ratio: Float[Array, " outputs"]) -> Point:
+    """The linearisation of a problem that has other weights, without another simulation.
+
+    **Arguments:**
+
+    - `point`: of the problem with its former weights.
+    - `ratio`: new weights over former ones. What a mix makes white knows no weights.
+    """
+    found = point.found
+    scale = ratio if problem.mix is None else jnp.ones_like(ratio)
+    changed = Sensitivity(
+        found.raw * ratio,
+        found.residual * scale,
+        found.jacobian * scale[:, None],
+        None if found.start is None else found.start * scale[:, None],
+    )
+    return products(problem, point.theta, point.start, changed)
 
 
 class Minimum(eqx.Module):
@@ -467,6 +547,7 @@ def minimise(
     max_steps: int,
     say: Callable[[str], None],
     deadline: float = math.inf,
+    known: Point | None = None,
 ) -> Minimum:
     """Levenberg–Marquardt inside bounds, over parameters and initial states together.
 
@@ -481,9 +562,11 @@ def minimise(
     - `max_steps`: largest number of steps, refused ones included.
     - `say`: told about every step.
     - `deadline`: of `time.perf_counter`, looked at before every step.
+    - `known`: the linearisation at the start, where there is one already.
     """
+    around = linearisation(problem)
     theta = jnp.asarray(np.clip(theta, problem.lower, problem.upper))
-    point = linearise(problem, theta, start)
+    point = around(theta, start) if known is None else known
     if not np.isfinite(point.loss):
         return Minimum(point, Status.diverged, 1)
     count = point.found.residual.size
@@ -501,7 +584,7 @@ def minimise(
         if promised <= tolerance**2 * float(point.loss) / count:
             return Minimum(point, Status.converged, k - 1)
         ahead = np.asarray(point.theta) + step, np.asarray(point.start) + start_step
-        trial = linearise(problem, *map(jnp.asarray, ahead))
+        trial = around(*map(jnp.asarray, ahead))
         say(f"iteration {k}, weighted squared error {float(trial.loss):.6g}")
         share = (float(point.loss) - float(trial.loss)) / gain
         if share > 0:

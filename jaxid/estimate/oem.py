@@ -19,6 +19,7 @@ from ..noise import ARFilter, Noise, VectorAR
 from ..parameters import Bounds
 from ..progress import working
 from ..recording import Recording, Recordings
+from ..sharding import taken
 from ..simulate import (
     Batch,
     at_rest,
@@ -26,10 +27,11 @@ from ..simulate import (
     prepare,
     set_substeps,
     simulate,
+    simulate_batch,
     with_substeps,
 )
 from ._base import AbstractMethod, Fit, Status, relative_errors
-from ._least_squares import Minimum, Problem, Sensitivity, minimise
+from ._least_squares import Minimum, Problem, Sensitivity, minimise, reweighted
 from .deviations import SAID, Deviations, Optimum, covariance_of
 from .didim import DIDIM, physical
 from .idim import IDIM
@@ -99,7 +101,7 @@ class OEM(AbstractMethod):
                 kept = _without_diverging(done.loop, recordings)
             if len(kept) < len(recordings):
                 done = self._from_start(loop, kept, say, deadline)
-            finer = _too_coarse(done, kept)
+            finer = _too_coarse(done)
             if finer is not None and time.perf_counter() < deadline:
                 say(f"again with {finer} steps between samples")
                 finer_loop = set_substeps(done.loop, finer)
@@ -142,12 +144,14 @@ def start_values(
 ) -> ClosedLoop:
     """The loop at the best start: its own values, IDIM's or DIDIM's, by simulated torque error.
 
-    Parameters in which torque is not linear keep their values.
+    DIDIM is asked only where the others leave much of the torque. Parameters in which torque is
+    not linear keep their values.
     """
     if start == "given":
         return loop
     say("start values by inverse dynamics")
-    candidates = [loop]
+    batch = prepare(loop, recordings)
+    candidates, errors = [loop], [_simulated_error(loop, recordings, batch)]
     for method in (IDIM(), DIDIM(max_steps=4)):
         try:
             found = method.fit(candidates[-1], recordings)
@@ -155,25 +159,36 @@ def start_values(
             continue
         if np.isfinite(found.theta).all():
             candidates.append(physical(loop, _linear_values(found)))
+            errors.append(_simulated_error(candidates[-1], recordings, batch))
+        if min(errors) < _NEAR:
+            break
     if isinstance(loop.controller, OpenLoop):
         return candidates[-1]
-    errors = [_simulated_error(candidate, recordings) for candidate in candidates]
     return candidates[int(np.argmin(errors))]
+
+
+# Share of the squared torque, mean over the joints, from which on a fit needs no better start.
+_NEAR = 0.2**2
 
 
 def _linear_values(fit: Fit) -> Float[np.ndarray, " parameters"]:
     return np.asarray(fit.theta)
 
 
-def _simulated_error(loop: ClosedLoop, recordings: Recordings) -> float:
-    """Sum over joints of the relative torque error of a simulation; infinite if it fails."""
-    runs = simulate(loop, recordings)
-    measured = compared(loop, recordings, [r.tau for r in recordings])
-    simulated = compared(loop, recordings, [np.asarray(run.tau) for run in runs])
-    pairs = list(zip(measured, simulated, strict=True))
-    error = sum(np.sum((m - s) ** 2, axis=0) for m, s in pairs)
-    size = sum(np.sum(m**2, axis=0) for m, _ in pairs)
-    total = float(np.sum(error / size))
+def _simulated_error(loop: ClosedLoop, recordings: Recordings, batch: Batch) -> float:
+    """Mean over joints of the squared relative torque error of a simulation; infinite if it fails.
+
+    An open loop has no torque to compare.
+    """
+    if isinstance(loop.controller, OpenLoop):
+        return np.inf
+    tau = simulate_batch(with_substeps(loop, recordings), batch).tau
+    there = np.asarray(batch.mask)[..., None]
+    measured, left = (np.where(there, x, 0.0) for x in (batch.tau, batch.tau - tau))
+    if batch.band is not None:
+        measured, left = batch.band(jnp.asarray(measured)), batch.band(jnp.asarray(left))
+    error, size = (np.sum(np.asarray(x) ** 2, axis=(0, 1)) for x in (left, measured))
+    total = float(np.mean(error / size))
     return total if np.isfinite(total) else np.inf
 
 
@@ -271,7 +286,7 @@ def _converge(
     first = weights = jnp.asarray(_first_weights(loop, pieces, signals))
     bounds = Bounds.of(loop.free_parameters)
     start = jnp.asarray(np.concatenate([batch.q0, batch.v0], axis=1))
-    total, minimum, problem = 0, None, None
+    total, minimum, problem, ratio = 0, None, None, jnp.ones_like(first)
     # Until the weights are known, a rough minimum is enough.
     worth = 1e-2
     for _ in range(20):
@@ -281,7 +296,10 @@ def _converge(
         mix = _mix(filters, weights)
         problem = Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix)
         left = method.max_steps - total
-        minimum = minimise(problem, loop.theta, start, method.tolerance, worth, left, say, deadline)
+        known = None if minimum is None else reweighted(problem, minimum.point, ratio)
+        minimum = minimise(
+            problem, loop.theta, start, method.tolerance, worth, left, say, deadline, known
+        )
         total += minimum.iterations
         if minimum.status is Status.diverged:
             break
@@ -297,6 +315,7 @@ def _converge(
             break
         if minimum.status is Status.max_seconds:
             break
+        ratio = new / weights
         weights, worth = new, 1e-4 if settled else worth
     assert minimum is not None
     assert problem is not None
@@ -343,22 +362,21 @@ def _new_weights(
     return jnp.asarray(1 / np.maximum(spread, _FLOOR / np.asarray(first)))
 
 
-def _too_coarse(done: _Done, recordings: Recordings) -> int | None:
+def _too_coarse(done: _Done) -> int | None:
     """A finer number of substeps, if halving the step moves the torque by more than 1e-4."""
     if done.minimum.status is Status.diverged or done.loop.stepping.control is not None:
         return None
     if isinstance(done.loop.controller, OpenLoop):
         return None
-    now = done.loop.stepping.substeps or 1
+    now, batch = done.loop.stepping.substeps or 1, done.batch
     # A few recordings fit the program that there is already; of many one says enough.
-    one = recordings
-    if len(recordings) > 4:
-        one = Recordings.of(min(recordings, key=lambda r: r.samples))
-    runs = [simulate(set_substeps(done.loop, k), one) for k in (now, 2 * now)]
-    coarse, fine = (
-        np.concatenate(compared(done.loop, one, [np.asarray(run.tau) for run in each]))
-        for each in runs
-    )
+    if len(done.pieces) > 4:
+        shortest = int(np.argmin([piece.samples for piece in done.pieces]))
+        batch = taken(batch, np.array([shortest]))
+    runs = [simulate_batch(set_substeps(done.loop, k), batch).tau for k in (now, 2 * now)]
+    coarse, fine = (x if batch.band is None else batch.band(jnp.asarray(x)) for x in runs)
+    there = np.asarray(batch.kept)
+    coarse, fine = np.asarray(coarse)[there], np.asarray(fine)[there]
     size = np.linalg.norm(fine, axis=0)
     error = np.linalg.norm(coarse - fine, axis=0) / np.where(size > 0, size, 1.0)
     if not np.isfinite(error).all() or error.max() <= 1e-4:

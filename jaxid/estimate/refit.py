@@ -20,6 +20,7 @@ from ._least_squares import (
     Sensitivity,
     absorb_start,
     linearise,
+    point_around,
     products,
     raw_residual,
     unfiltered,
@@ -195,7 +196,7 @@ def _refit_some(optimum: Optimum, lanes: Lanes, steps: int) -> Refitted:
             upper=lane.upper,
         )
         theta, initials = _settle(mine, near, lane.theta, start, steps)
-        point = linearise(mine, theta, initials)
+        point = point_around(mine, theta, initials)
         low, high = mine.lower - theta, mine.upper - theta
         step, _, promise = _bounded_step(point, low, high, jnp.zeros(()))
         found = point.found
