@@ -13,10 +13,9 @@ from textwrap import wrap
 from typing import Any, Literal
 
 import numpy as np
+import plotly
 import plotly.graph_objects as go
-import plotly.io as pio
 from jaxtyping import Bool, Float, Real
-from plotly.subplots import make_subplots
 
 Role = Literal["measured", "simulated", "residual", "reference", "band"]
 
@@ -104,7 +103,7 @@ def theme() -> go.layout.Template:
             "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": INK, "activecolor": BLUE},
         }
     )
-    pio.templates["jaxid"] = template
+    plotly.io.templates["jaxid"] = template
     return template
 
 
@@ -126,7 +125,7 @@ def signals(
     if not panels or not all(panels):
         raise ValueError("signals() draws panels of at least one trace each; one is empty.")
     heights = [1.0 if any(t.role != "residual" for t in panel) else 0.5 for panel in panels]
-    figure = make_subplots(
+    figure = go.Figure().set_subplots(
         rows=len(panels), cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=heights
     )
     names = titles or [panel[0].name for panel in panels]
@@ -319,7 +318,7 @@ def autocorrelation(
         bound: Two standard deviations of a white residual's autocorrelation.
         title: Of the whole figure.
     """
-    figure = make_subplots(rows=1, cols=1)
+    figure = go.Figure().set_subplots(rows=1, cols=1)
     _add_acf(figure, lags, acf, bound, 1, 1)
     figure.update_xaxes(title_text="lag (samples)")
     figure.update_yaxes(title_text="autocorrelation")
@@ -550,7 +549,7 @@ def shares_in_time(
         title: Of the whole figure.
     """
     together = np.sum(list(shares.values()), axis=0, initial=0.0) + np.zeros_like(residual)
-    figure = make_subplots(
+    figure = go.Figure().set_subplots(
         rows=3, cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=[1.0, 1.0, 0.6]
     )
     whole = [
@@ -575,7 +574,7 @@ def shares_in_time(
 
 def _comparison_grid(joints: int) -> go.Figure:
     """Give for each joint a high and a low panel on the left, and one beside both."""
-    return make_subplots(
+    return go.Figure().set_subplots(
         rows=2 * joints,
         cols=2,
         specs=[[{}, {"rowspan": 2}], [{}, None]] * joints,

@@ -2,8 +2,8 @@
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy import interpolate, linalg, signal
 
 from .errors import FitError
 from .recording import Recording
@@ -116,7 +116,7 @@ def period_of(recording: Recording, period: float | None = None) -> float:
     scaled = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), 1e-300)
     # Mean square difference at every lag, from sums of squares and the correlation.
     square = np.concatenate([[0.0], np.cumsum(np.sum(scaled**2, axis=1))])
-    product = sum(signal.correlate(c, c, method="fft")[n - 1 :] for c in scaled.T)
+    product = sum(scipy.signal.correlate(c, c, method="fft")[n - 1 :] for c in scaled.T)
     differ = (square[n - lags] + square[n] - square[lags] - 2 * np.asarray(product)[lags]) / (
         n - lags
     )
@@ -174,8 +174,8 @@ def settle_harmonics(recording: Recording, period: float, harmonics: int | None)
     most = min(most, 100)
     wide = fourier_basis(time, period, most)[0]
     # Gram-Schmidt by Cholesky: the waves are all but orthogonal, and there are many samples.
-    lower = linalg.cholesky(wide.T @ wide, lower=True)
-    parts = linalg.solve_triangular(lower, wide.T @ x, lower=True) ** 2
+    lower = scipy.linalg.cholesky(wide.T @ wide, lower=True)
+    parts = scipy.linalg.solve_triangular(lower, wide.T @ x, lower=True) ** 2
     gained = np.concatenate([parts[:1], parts[1::2] + parts[2::2]])
     left = np.sum(x**2, axis=0) - np.cumsum(gained, axis=0)
     n = recording.samples
@@ -245,4 +245,4 @@ def resampled_at(
     near = np.round(place).astype(int)
     if np.all(np.abs(place - near) < 1e-6):
         return x[np.clip(near, 0, len(x) - 1)]
-    return interpolate.CubicSpline(time, x)(at)
+    return scipy.interpolate.CubicSpline(time, x)(at)

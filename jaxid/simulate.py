@@ -537,7 +537,7 @@ def _slopes(loop: ClosedLoop, q: Float[Array, "points joints"]) -> Float[Array, 
         reference = Reference(at, zeros, zeros, zeros)
         state = unflatten(loop)(x)
         outside = Outside(zeros, zeros, Reading(zeros, zeros))
-        now = instant(loop, jnp.zeros(()), state, reference, outside, NOBODY)
+        now = instant(loop, jnp.zeros(()), state, reference, outside, jnp.asarray(NOBODY))
         return ravel_pytree(now.derivative)[0]
 
     return jax.vmap(lambda at: jax.jacfwd(rate)(ravel_pytree(rest(loop, at, zeros))[0], at))(q)
@@ -549,4 +549,5 @@ def _fastest(loop: ClosedLoop, q: Float[Array, "points joints"]) -> float:
     return float(np.abs(np.linalg.eigvals(usable)).max()) if len(usable) else 0.0
 
 
-NOBODY = jnp.asarray(0)
+# Of no recording: effects that act on some by name do not act.
+NOBODY = 0

@@ -97,6 +97,15 @@ def test_new_weights_need_no_simulation():
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.max(np.abs(a), initial=0.0))
 
 
+def test_importing_uses_no_device_and_waits_for_no_statistics():
+    """Other processes can still be joined after it, and a command starts sooner."""
+    code = (
+        "import sys, jaxid; from jax._src import xla_bridge; assert not xla_bridge._backends; "
+        "assert not {'scipy.stats', 'scipy.signal', 'scipy.optimize'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
 def _problem(loop, recordings):
     """What OEM minimises, with every initial state free, and where it starts."""
     loop = with_substeps(loop, recordings)

@@ -10,8 +10,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy import linalg
 
 from ..errors import ModelError, require
 from ..parameters import list_parameters, read_values, write_values
@@ -256,7 +256,7 @@ def _solve(
     size, n = B.shape
     P = cvxpy.Variable((size, size), symmetric=True)
     room, share = cvxpy.Variable(), cvxpy.Variable()
-    half = np.real(linalg.sqrtm(mu))
+    half = np.real(scipy.linalg.sqrtm(mu))
     corner = P @ B @ half
     upper = A.T @ P + P @ A + share * (K.T @ K) + room * np.eye(size)
     block = cvxpy.bmat([[-upper, -corner], [-corner.T, share * np.eye(n)]])

@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy import linalg, signal
 
 from ..effects import Motion
 from ..errors import FitError
@@ -60,7 +60,7 @@ def errors_of(
     impulse[span] = 1.0
     answer = kernels(impulse)[..., 0]
     cross = np.array(
-        [[signal.correlate(one, two, "full", "fft") for two in answer] for one in answer]
+        [[scipy.signal.correlate(one, two, "full", "fft") for two in answer] for one in answer]
     )
     by_lag = np.moveaxis(cross[:, :, length - 1 :: factor], 2, 0)
     size = np.sqrt(np.einsum("kk->k", by_lag[0]))
@@ -160,9 +160,9 @@ def _banded_whitening(
         try:
             with_rest = band.copy()
             with_rest[0] += diagonal
-            lower = linalg.cholesky_banded(with_rest, lower=True)
+            lower = scipy.linalg.cholesky_banded(with_rest, lower=True)
             break
-        except linalg.LinAlgError:
+        except scipy.linalg.LinAlgError:
             # Correlations cut at a millionth may leave it a shade indefinite.
             diagonal = 10 * diagonal
     else:
@@ -171,7 +171,7 @@ def _banded_whitening(
         )
 
     def whiten(x: np.ndarray) -> np.ndarray:
-        return linalg.solve_banded((len(lower) - 1, 0), lower, x)
+        return scipy.linalg.solve_banded((len(lower) - 1, 0), lower, x)
 
     return whiten
 

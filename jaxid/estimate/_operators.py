@@ -4,8 +4,8 @@ import itertools
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy import interpolate, linalg, signal
 
 from ..errors import FitError
 from ..recording import Recording
@@ -63,7 +63,7 @@ class Operator(eqx.Module):
         pieces = np.zeros((4, len(flat) - 1, flat.shape[1]))
         pieces[0] = flat[:-1]
         if not held:
-            spline = interpolate.CubicSpline(self.step * np.arange(len(flat)), flat)
+            spline = scipy.interpolate.CubicSpline(self.step * np.arange(len(flat)), flat)
             pieces = spline.c[::-1] * np.array([1.0, 1.0, 2.0, 6.0])[:, None, None]
         stages = self._stages(pieces, flat[0])
         # A stage is y' = λ (u - y), with the one before as u.
@@ -85,14 +85,14 @@ class Operator(eqx.Module):
             rate[j, j] = -pole
             rate[j, n if j == 0 else j - 1] = pole
         rate[range(n, n + 3), range(n + 1, n + 4)] = 1.0
-        step = linalg.expm(rate * self.step)[:n]
+        step = scipy.linalg.expm(rate * self.step)[:n]
         stages: list[np.ndarray] = []
         for j in range(n):
             force = np.tensordot(step[j, n:], pieces, 1)
             for i, earlier in enumerate(stages):
                 force = force + step[j, i] * earlier[:-1]
             state = (step[j, j] * start)[None]
-            after, _ = signal.lfilter([1.0], [1.0, -step[j, j]], force, axis=0, zi=state)
+            after, _ = scipy.signal.lfilter([1.0], [1.0, -step[j, j]], force, axis=0, zi=state)
             stages.append(np.concatenate([start[None], after]))
         return stages
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
+import scipy
 from jaxtyping import Float
-from scipy import interpolate, optimize, stats
 
 from .. import figures
 from ..errors import FitError
@@ -42,15 +42,15 @@ class Profile(AbstractShown):
         """
         centre = self.fit.theta[self.fit.names.index(self.name)]
         root = np.sign(self.values - centre) * np.sqrt(self.deviance)
-        along = interpolate.PchipInterpolator(self.values, root)
-        reach = float(np.sqrt(stats.chi2.ppf(level, 1)))
+        along = scipy.interpolate.PchipInterpolator(self.values, root)
+        reach = float(np.sqrt(scipy.stats.chi2.ppf(level, 1)))
         ends = []
         for sign, end in ((-1, self.values[0]), (1, self.values[-1])):
             if sign * float(along(end)) <= reach:
                 ends.append(float(end))
                 continue
             goal = sign * reach
-            found = optimize.root_scalar(
+            found = scipy.optimize.root_scalar(
                 lambda x, g=goal: float(along(x)) - g, bracket=(float(centre), float(end))
             )
             ends.append(float(found.root))

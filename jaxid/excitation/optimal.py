@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
+import scipy
 from jaxtyping import Array, Float
-from scipy import linalg, optimize
-from scipy.stats import qmc
 
 from .. import figures
 from ..errors import FitError, LimitsError
@@ -307,7 +306,7 @@ def _grid(joints: int) -> Float[np.ndarray, "points joints"]:
     if joints <= 2:
         axes = np.meshgrid(*[np.linspace(0.02, 0.98, 49)] * joints, indexing="ij")
         return np.concatenate([middle, np.stack([x.ravel() for x in axes], axis=1)])
-    return np.concatenate([middle, qmc.Sobol(joints, scramble=False).random(4096)])
+    return np.concatenate([middle, scipy.stats.qmc.Sobol(joints, scramble=False).random(4096)])
 
 
 def make_design(
@@ -334,7 +333,7 @@ def make_design(
     rest = at_start[1:] if start is None else at_start
     # High harmonics are small: their speed and acceleration grow with their number.
     own = 1 / np.concatenate([[1.0], np.repeat(np.arange(1, harmonics + 1), 2)]) ** 1.5
-    span = own[:, None] * linalg.null_space(rest * own)
+    span = own[:, None] * scipy.linalg.null_space(rest * own)
     base = np.zeros((2 * harmonics + 1, loop.joints))
     level = np.zeros_like(base)
     level[0] = pose
@@ -497,7 +496,7 @@ def _descend_on(
         value, slope = _score_and_slope(design, jnp.asarray(x))
         return float(value), np.asarray(slope)
 
-    found = optimize.minimize(
+    found = scipy.optimize.minimize(
         score,
         z,
         jac=True,

@@ -6,8 +6,8 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 import pandas as pd
+import scipy
 from jaxtyping import Float
-from scipy import signal
 
 from ..errors import NoiseError
 from .whiteness import ljung_box
@@ -81,7 +81,9 @@ class ARFilter(eqx.Module):
 
     def whiten(self, x: Float[np.ndarray, "samples *axes"]) -> Float[np.ndarray, "samples *axes"]:
         """A(z) x along the first axis; what came before the first sample counts as zero."""
-        return np.asarray(signal.lfilter(self.polynomial, [1.0], np.asarray(x, float), axis=0))
+        return np.asarray(
+            scipy.signal.lfilter(self.polynomial, [1.0], np.asarray(x, float), axis=0)
+        )
 
     def stabilised(self) -> "ARFilter":
         """The stable filter of the same spectrum: poles outside the unit circle turned inside."""
@@ -105,7 +107,7 @@ class ARFilter(eqx.Module):
         settle = min(50_000, int(np.ceil(np.log(1e-4) / np.log(min(slowest, 0.9999))))) + 1
         lead = settle if filt.order else 0
         white = rng.standard_normal((*shape[:-1], shape[-1] + lead))
-        noise = signal.lfilter([np.sqrt(filt.variance)], filt.polynomial, white, axis=-1)
+        noise = scipy.signal.lfilter([np.sqrt(filt.variance)], filt.polynomial, white, axis=-1)
         return np.asarray(noise)[..., lead:]
 
     def taps(self, size: int) -> Float[np.ndarray, " size"]:

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 import pandas as pd
+import scipy
 from jaxtyping import Float
-from scipy import linalg, signal
 
 from ..errors import NoiseError
 from .ar import ARFilter, Criterion, check_series, choose
@@ -60,7 +60,10 @@ class VectorAR(eqx.Module):
         taps = self.taps(self.order + 1)
         return np.stack(
             [
-                sum(np.asarray(signal.lfilter(b, [1.0], y)) for b, y in zip(a, x.T, strict=True))
+                sum(
+                    np.asarray(scipy.signal.lfilter(b, [1.0], y))
+                    for b, y in zip(a, x.T, strict=True)
+                )
                 for a in taps
             ],
             axis=1,
@@ -154,7 +157,7 @@ def _nuttall_strand(
         bb = np.array(sum(g @ g.T for _, g in pairs))
         fb = np.array(sum(f @ g.T for f, g in pairs))
         left, right = ff @ np.linalg.inv(ahead), np.linalg.inv(behind) @ bb
-        cross = linalg.solve_sylvester(left, right, 2 * fb)
+        cross = scipy.linalg.solve_sylvester(left, right, 2 * fb)
         k, back = -cross @ np.linalg.inv(behind), -cross.T @ np.linalg.inv(ahead)
         forward = [f + k @ g for f, g in pairs]
         backward = [g + back @ f for f, g in pairs]

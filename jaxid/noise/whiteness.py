@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy import stats
 
 
 def autocovariance(
@@ -74,4 +74,4 @@ def ljung_box(
     weight = np.divide(total * (total + 2.0), pairs, where=pairs > 0, out=0.0 * at)
     statistic = float(np.sum(weight * correlation**2))
     freedom = max(lags - fitted, 1)
-    return LjungBox(statistic, freedom, float(stats.chi2.sf(statistic, freedom)))
+    return LjungBox(statistic, freedom, float(scipy.stats.chi2.sf(statistic, freedom)))
