@@ -1,7 +1,7 @@
 """The blind bench: hidden effects drawn anew, given to `jaxid.discover`, judged by the truth.
 
 python -m benchmarks.hidden_effects [--seed N] [--quick] [--json FILE] [--jobs 2] [--out DIR]
-                                    [--robot scara|two_link]
+                                    [--robot scara|two_link|axis]
 """
 
 import argparse
@@ -59,16 +59,18 @@ class Wanted:
 def draw_wanted(master: int, quick: bool = False, robot: str = "scara") -> list[Wanted]:
     """The cases of one run, shuffled, so that a part of them says something of all."""
     rng = np.random.default_rng(master)
+    there = sim.applicable(robot)
+    known, strange = ([n for n in names if n in there] for names in (sim.CATALOGUE, sim.OUTSIDE))
     if quick:
-        names = rng.choice(sim.CATALOGUE, 5, replace=False).tolist()
+        names = rng.choice(known, 5, replace=False).tolist()
         plain = [("single", (n,)) for n in names[:3]] + [("double", tuple(names[3:]))]
-        plain += [("clean", ()), ("outside", (str(rng.choice(sim.OUTSIDE)),))]
+        plain += [("clean", ()), ("outside", (str(rng.choice(strange)),))]
     else:
-        plain = [("single", (name,)) for name in sim.CATALOGUE for _ in range(3)]
-        plain += [("double", _pair(rng)) for _ in range(20)]
+        plain = [("single", (name,)) for name in known for _ in range(3)]
+        plain += [("double", _pair(rng, known)) for _ in range(20)]
         plain += [("clean", ()) for _ in range(20)]
-        again = rng.choice(sim.OUTSIDE, 5, replace=False).tolist()
-        plain += [("outside", (name,)) for name in (*sim.OUTSIDE, *again)]
+        again = rng.choice(strange, 5, replace=False).tolist()
+        plain += [("outside", (name,)) for name in (*strange, *again)]
     colours = rng.choice(COLOURS, len(plain)).tolist()
     # Half of the clean cases in strongly coloured noise: there false alarms are born.
     clean = [k for k, (kind, _) in enumerate(plain) if kind == "clean"]
@@ -82,10 +84,10 @@ def draw_wanted(master: int, quick: bool = False, robot: str = "scara") -> list[
     ]
 
 
-def _pair(rng: np.random.Generator) -> tuple[str, ...]:
+def _pair(rng: np.random.Generator, known: Sequence[str]) -> tuple[str, ...]:
     """Two names that can be on one robot, wherever they are put."""
     while True:
-        names = tuple(rng.choice(sim.CATALOGUE, 2, replace=False).tolist())
+        names = tuple(rng.choice(known, 2, replace=False).tolist())
         if not set(names) <= TRANSMISSIONS:
             return names
 
@@ -99,6 +101,8 @@ def start_model(case: sim.Case) -> jaxid.ClosedLoop:
     """The model that a user would start from: the robot under its controller, without effects."""
     if case.robot == "scara":
         return jaxid.scara()
+    if case.robot == "axis":
+        return jaxid.emps()
     law = case.controller
     assert isinstance(law, sim.PD)
     return jaxid.two_link(jaxid.control.PD(Kp=list(law.Kp), Kv=list(law.Kv), Kg=list(law.Kg)))
@@ -564,7 +568,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, help="file for all results")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, help="folder in which a stopped run goes on")
-    parser.add_argument("--robot", choices=("scara", "two_link"), default="scara")
+    parser.add_argument("--robot", choices=("scara", "two_link", "axis"), default="scara")
     parser.add_argument("--only", choices=KINDS, help="cases of one kind")
     parser.add_argument("--case", type=int, action="append", help="only the case of this number")
     given = parser.parse_args(arguments)

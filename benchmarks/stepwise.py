@@ -17,7 +17,7 @@ from scipy import stats
 import jaxid
 from jaxid import effects as fx
 from jaxid.errors import FitError
-from jaxid.estimate._regression import decimator, filtered, regression
+from jaxid.estimate._regression import decimator, filtered, linear_parameters, regression
 from jaxid.loop import inverse
 from jaxid.parameters import list_parameters, read_values, write_values
 from jaxid.simulate import Simulated, recording_label
@@ -128,7 +128,7 @@ def assemble(loop: jaxid.ClosedLoop, recordings: jaxid.Recordings) -> Rows:
         rights.append(reduce(right))
     base, right = np.concatenate(bases), np.concatenate(rights)
     theta = np.linalg.lstsq(_flat(base), right.reshape(-1), rcond=None)[0]
-    fitted = loop.with_theta(jnp.asarray(theta))
+    fitted = write_values(loop, linear_parameters(loop), jnp.asarray(theta))
     weight = 1 / np.sqrt(np.mean((right - base @ theta) ** 2, axis=0))
     tones = _tones(
         [r - b @ theta for r, b in zip(rights, bases, strict=True)], recordings, reducers

@@ -104,8 +104,18 @@ class ClosedLoop(eqx.Module):
         return read_values(self, self.free_parameters)
 
     def with_theta(self, theta: Vector) -> "ClosedLoop":
-        """The same loop with other values for its free parameters, `(parameters,)`."""
-        return write_values(self, self.free_parameters, theta)
+        """The same loop with other values for its free parameters, `(parameters,)`.
+
+        **Raises:** `ModelError` where they are not as many.
+        """
+        parameters = self.free_parameters
+        count = sum(p.size for p in parameters)
+        if theta.shape != (count,):
+            raise ModelError(
+                f"theta has shape {theta.shape}, but {self.name} has {count} free parameters: give "
+                "one value for each of loop.names, in that order"
+            )
+        return write_values(self, parameters, theta)
 
     def with_values(self, **values: float) -> "ClosedLoop":
         """The same loop with parameters set by name.

@@ -129,6 +129,12 @@ def test_units_of_joints_that_slide():
 # --- reading and writing ----------------------------------------------------------------------
 
 
+def test_values_that_are_not_as_many_are_refused():
+    loop = jaxid.scara()
+    with pytest.raises(ModelError, match="8 free parameters: give one value for each"):
+        loop.with_theta(loop.theta[:-1])
+
+
 def test_several_values_are_one_parameter_with_a_name_each():
     loop = jaxid.scara().add(Curve(joint=2))
     curve = loop.parameters[-1]

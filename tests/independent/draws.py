@@ -39,7 +39,9 @@ def free_inertia(m: list[list[float]], j: int) -> float:
 
 def applicable(robot: str) -> tuple[str, ...]:
     """Names of all effects, catalogue and outside, that make sense on a robot."""
-    pointless = ("gravity", "rotor_inertia", "cross_coupling", "cross_bump")
+    # One axis cannot tell them from its own mass, friction and offset, or has no other joint.
+    same = ("gravity", "rotor_inertia", "torque_offset", "drive_gain")
+    pointless = (*same, "cross_coupling", "cross_bump")
     return tuple(n for n in CATALOGUE + OUTSIDE if robot != "axis" or n not in pointless)
 
 
