@@ -1,4 +1,4 @@
-"""One simulation, one Jacobian and one whole fit of the SCARA, by jaxid and by its peers.
+"""One simulation, one Jacobian, one whole fit and one start, by jaxid and by its peers.
 
 All do the same: RK4 with four steps in each sampling interval and the same cubic of the reference
 (SciPy: an adaptive solver at a tolerance that gives the same accuracy). MuJoCo has no arctan
@@ -12,8 +12,10 @@ python -m benchmarks.peers [--quick] [--json FILE]
 import ctypes
 import dataclasses
 import functools
+import os
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -347,12 +349,13 @@ def fitted(peer: Peer, recs: jaxid.Recordings) -> tuple[np.ndarray, float]:
 
 
 def main() -> None:
-    """Prints the two tables."""
+    """Prints what was measured, one table."""
     given = options(__doc__)
     seconds, count, budget = (2.0, 4, 3.0) if given.quick else (20.0, 64, 60.0)
     print(machine())
     rows = per_call(seconds, count, budget)
     rows += whole_fits(seconds, given.quick)
+    rows += cold_starts(1 if given.quick else 3)
     report(pd.DataFrame(rows).set_index(["task", "recordings", "who"]), given.json)
 
 
@@ -429,6 +432,38 @@ def whole_fits(seconds: float, quick: bool) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def cold_starts(turns: int) -> list[dict[str, Any]]:
+    """Seconds from starting Python to the printed table of `jaxid fit`, beside bare imports."""
+    files = sorted(str(f) for f in (Path(jaxid.__file__).parent / "demo" / "clean").glob("fit_*"))
+    command = "from jaxid.cli import main; main()"
+    imports, filled = "imports of jax, diffrax, optimistix", "jaxid fit, filled cache"
+    best: dict[str, float] = {}
+
+    def started(name: str, cache: str, code: str, *arguments: str) -> None:
+        environment = {**os.environ, "XDG_CACHE_HOME": cache}
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+        begun = time.perf_counter()
+        argv = [sys.executable, "-c", code, *arguments]
+        subprocess.run(argv, env=environment, check=True, stdout=subprocess.DEVNULL)
+        best[name] = min(best.get(name, np.inf), time.perf_counter() - begun)
+
+    for _ in range(turns):
+        with tempfile.TemporaryDirectory() as cache:
+            started(imports, cache, "import jax, diffrax, optimistix")
+            started("jaxid fit, empty cache", cache, command, "fit", *files)
+            started(filled, cache, command, "fit", *files)
+    return [
+        {
+            "task": "cold start",
+            "recordings": len(files) if name != imports else 0,
+            "who": name,
+            "cold_s": seconds,
+            "times_imports": seconds / best[imports],
+        }
+        for name, seconds in best.items()
+    ]
 
 
 if __name__ == "__main__":

@@ -117,6 +117,7 @@ def sampled_loop():
     ("model", "kind", "criterion"),
     [
         (loop, "inverse-dynamics", "deviation"),
+        (loop, "closed-loop", "determinant"),
         (sampled_loop, "closed-loop", "determinant"),
     ],
 )
