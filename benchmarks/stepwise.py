@@ -82,7 +82,7 @@ def _enter(rows: Rows, basis: np.ndarray) -> tuple[Entry | None, np.ndarray]:
         if own.shape[1] == 0:
             continue
         taken = float(np.sum((own.T @ rest) ** 2))
-        bic = count * np.log(left - taken) + own.shape[1] * np.log(count)
+        bic = count * np.log(max(left - taken, 1e-12 * left)) + own.shape[1] * np.log(count)
         if bic < price:
             spare = count - basis.shape[1] - own.shape[1]
             f = taken / own.shape[1] / ((left - taken) / spare)

@@ -37,9 +37,13 @@ def shares_of(count: int, parts: int) -> list[Int[np.ndarray, " rows"]]:
 
 
 def at_once(fun: Callable[[Given], Result], parts: Sequence[Given]) -> list[Result]:
-    """The function of each part, one a thread: XLA runs a loop on the core of its caller."""
+    """The function of each part, by as many threads as there are cores.
 
-    with ThreadPoolExecutor(len(parts)) as pool:
+    XLA runs a loop on the core of its caller, and compiles without holding Python's lock.
+    """
+    if not parts:
+        return []
+    with ThreadPoolExecutor(min(len(parts), cores())) as pool:
         return list(pool.map(lambda part: jax.block_until_ready(fun(part)), parts))
 
 

@@ -16,6 +16,7 @@ from ..errors import ModelError
 from ..loop import ClosedLoop, effect_loads
 from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..recording import Recordings
+from ..sharding import at_once
 from ..simulate import Batch, each, initial, run
 from .linear import Linearised, respond
 
@@ -301,9 +302,11 @@ def signatures(
             table[..., behind] = respond(linear, "pull", push[..., np.array(behind)])
         blocks.append(table)
     rest = [k for k in range(len(proposed)) if k not in made]
-    for stacked, places in _grouped([proposed[k][0] for k in rest]):
-        say(f"{stacked.effect_name()} by simulation")
-        moved = np.asarray(_finite(loop, stacked, batch, row))
+    groups = _grouped([proposed[k][0] for k in rest])
+    say(f"{len(rest)} signatures by simulation")
+    # Most of the first time is compiling, one program a structure.
+    runs = at_once(lambda group: np.asarray(_finite(loop, group[0], batch, row)), groups)
+    for (_, places), moved in zip(groups, runs, strict=True):
         with np.errstate(over="ignore"):  # a loop that runs away is left out below
             columns = (moved - np.asarray(linear.seen[:, :, row])[..., None]).astype(np.float32)
         low, high = _amplitude_bounds(proposed[rest[places[0]]][0])
