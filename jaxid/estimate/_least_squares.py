@@ -4,6 +4,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -411,32 +412,32 @@ def products(
 ) -> Point:
     """What a step needs of a linearisation."""
     loop = problem.loop.with_theta(theta[: problem.loop.theta.shape[0]])
-    count, p = start.shape[0], theta.shape[0]
-    r = found.residual.reshape(count, -1)
-    j = found.jacobian.reshape(count, -1, p)
-    if found.start is None:
-        s = jnp.zeros((count, r.shape[1], 0))
-    else:
-        s = found.start.reshape(count, r.shape[1], -1) * problem.free[:, None, None]
-    loss = jnp.sum(r**2)
-    gram, start_gram = jnp.einsum("rkp,rkq->pq", j, j), jnp.einsum("rka,rkb->rab", s, s)
+    loss, *sums = _sums(found.residual, found.jacobian, found.start, problem.free)
+    gram, _, start_gram, _, _ = sums
     # By the squares: a loop close to running away has derivatives that are finite and useless.
     sound = jnp.isfinite(loss) & jnp.isfinite(jnp.sum(gram)) & jnp.isfinite(jnp.sum(start_gram))
     sound = sound & (loop.arm.smallest_inertia() > 0)
-    return Point(
-        theta,
-        start,
-        found,
-        jnp.where(sound, loss, jnp.inf),
-        gram,
-        jnp.einsum("rkp,rk->p", j, r),
-        start_gram,
-        jnp.einsum("rka,rk->ra", s, r),
-        jnp.einsum("rka,rkp->rap", s, j),
+    return Point(theta, start, found, jnp.where(sound, loss, jnp.inf), *sums)
+
+
+def _sums(residual: Any, jacobian: Any, by_start: Any, free: Any) -> tuple[Any, ...]:
+    """Squared error, and the products of `Point` in their order; of NumPy's arrays or JAX's."""
+    count, p = free.shape[0], jacobian.shape[-1]
+    r, j = residual.reshape(count, -1), jacobian.reshape(count, -1, p)
+    s = j[..., :0]
+    if by_start is not None:
+        s = by_start.reshape(*j.shape[:2], -1) * free[:, None, None]
+    flat, across = j.reshape(-1, p), s.swapaxes(1, 2)
+    return (
+        (r**2).sum(),
+        flat.T @ flat,
+        r.reshape(-1) @ flat,
+        across @ s,
+        (across @ r[..., None])[..., 0],
+        across @ j,
     )
 
 
-@eqx.filter_jit
 def reweighted(problem: Problem, point: Point, ratio: Float[Array, " outputs"]) -> Point:
     """The linearisation of a problem that has other weights, without another simulation.
 
@@ -445,15 +446,18 @@ def reweighted(problem: Problem, point: Point, ratio: Float[Array, " outputs"]) 
     - `point`: of the problem with its former weights.
     - `ratio`: new weights over former ones. What a mix makes white knows no weights.
     """
-    found = point.found
-    scale = ratio if problem.mix is None else jnp.ones_like(ratio)
-    changed = Sensitivity(
-        found.raw * ratio,
-        found.residual * scale,
-        found.jacobian * scale[:, None],
-        None if found.start is None else found.start * scale[:, None],
-    )
-    return products(problem, point.theta, point.start, changed)
+    raw = np.asarray(ratio)
+    scale = raw if problem.mix is None else np.ones_like(raw)
+    found, by_start = point.found, point.found.start
+    residual = np.asarray(found.residual) * scale
+    jacobian = np.asarray(found.jacobian) * scale[:, None]
+    if by_start is not None:
+        by_start = np.asarray(by_start) * scale[:, None]
+    # On the host: as a program it would be compiled for every loop, which takes longer.
+    sums = _sums(residual, jacobian, by_start, np.asarray(problem.free))
+    changed = np.asarray(found.raw) * raw, residual, jacobian, by_start
+    changed, sums = jax.device_put((changed, sums))
+    return Point(point.theta, point.start, Sensitivity(*changed), *sums)
 
 
 class Minimum(eqx.Module):
