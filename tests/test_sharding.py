@@ -80,8 +80,17 @@ def test_cores_that_share_recordings_give_the_linearisation_of_one(law, monkeypa
     loop, recordings = jaxid.scara(law), jaxid.read(*FILES)
     problem, theta, start = _problem(loop, recordings)
     one = point_around(problem, theta, start)
+    seen = []
+
+    def spy(part, theta, start):
+        seen.append(start.shape[0])
+        return point_around(part, theta, start)
+
     monkeypatch.setattr(least_squares, "cores", lambda: 2)
+    monkeypatch.setattr(least_squares, "_WORTH_SHARING", 0)
+    monkeypatch.setattr(least_squares, "point_around", spy)
     shared = linearise(problem, theta, start)
+    assert seen == [2, 2]
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(shared), strict=True):
         assert a.shape == b.shape
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.max(np.abs(a), initial=0.0))

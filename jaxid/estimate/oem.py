@@ -48,8 +48,8 @@ class OEM(AbstractMethod):
 
     - `output`: what is compared: `"torque"`, `"position"` or `"both"`; by default torque, but
       position where the recorded torque drives the arm.
-    - `start`: `"auto"` takes the best of the loop's own values, IDIM's and DIDIM's; `"given"`
-      starts from the loop's values.
+    - `start`: `"auto"` takes the best of the loop's own values, IDIM's and, where those leave more
+      than a fifth of the torque, DIDIM's; `"given"` starts from the loop's values.
     - `initial`: `"rest"` trusts the first sample, `"free"` estimates every initial state,
       `"auto"` estimates those of recordings that do not start at rest.
     - `window`: length in s of pieces simulated on their own, each from its own estimated state
