@@ -326,7 +326,8 @@ def test_contact_is_free_from_the_start_in_some_refits(offset_case, offset_story
     assert ["kc2" in loop.names for loop in loops] == [False, False, True, True]
     # Without noise filters, which knew nothing of a gap.
     assert [type(method) for method in plain] == [jaxid.OEM, jaxid.OEM]
-    assert len(search.starts(start, of["joint_elasticity", 2])) == 2
+    assert len(search.starts(start, of["joint_elasticity", 2])) == 3
+    assert [f.order for f in plain[-1].filters] == [0, 0]
     assert len(search.starts(start, of["spring", 2])) == 1
 
 

@@ -34,6 +34,7 @@ from jaxid.effects import (
 from jaxid.errors import ModelError
 from jaxid.parameters import Scalar, parameter
 from jaxid.simulate import fastest_rate, with_substeps
+from jaxid.stepping import RK4
 
 LINES = sim.MultiSine(
     (((0.5, 2.0, 0.3), (0.2, 5.0, 1.0)), ((0.6, 3.0, 2.0), (0.2, 6.0, 0.5))), rise=1.0
@@ -458,6 +459,16 @@ def test_adaptive_steps_agree_with_fixed_ones(rigid):
     # Fixed steps of 1.25 ms; the two references are splines of different length.
     np.testing.assert_allclose(run.tau[:55], rigid.tau[:55], atol=1e-5)
     np.testing.assert_allclose(run.q[:55], rigid.q[:55], atol=1e-6)
+
+
+def test_stages_in_a_loop_are_the_same_method():
+    few = recorded(plain()).slice(0.0, 0.5)
+    written, rolled = (
+        simulated(scara(stepping=jaxid.Stepping(solver=RK4(rolled=way), substeps=4)), few)
+        for way in (False, True)
+    )
+    np.testing.assert_allclose(rolled.tau, written.tau, rtol=1e-11)
+    np.testing.assert_allclose(rolled.states, written.states, rtol=1e-11, atol=1e-14)
 
 
 def default_error(loop, run):

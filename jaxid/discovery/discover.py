@@ -348,11 +348,11 @@ class _Search(eqx.Module):
     def starts(self, last: Step, verdict: Verdict, wide: float = 10.0) -> list[ClosedLoop]:
         """Where refits with an effect begin: at its prediction; from several where that is far off.
 
-        What was screened at a finite setting may start in another valley at its prediction. And
+        What was screened at a finite setting may start in another valley at its prediction, and
+        noise filters that knew nothing of it may bar the way out, so one refit begins without. And
         where drive and link part and meet again nearly every valley is a wrong one while the
         contact's stiffness is held at a wrong value; with that free from the start, and from a gap
-        that is too wide, where the link flies longest and all parameters show, few are. Noise
-        filters that knew nothing of it would hide just that, so those refits begin without.
+        that is too wide, where the link flies longest and all parameters show, few are.
         """
 
         def grown(effect: AbstractEffect) -> ClosedLoop:
@@ -362,14 +362,17 @@ class _Search(eqx.Module):
         if amplitudes(effect):
             return found
         found.append(grown(effect))
-        if effect.contact:
-            held = _held_shapes(found[0])
-            plain = dataclasses.replace(_quiet(self.method), start="given")
-            found += [
-                fit(grown(effect.scaled(factor)).free(*held), self.recordings, plain).loop
-                for factor in (1.0, wide)
-            ]
-        return found
+        if not effect.contact:
+            # Output error, by the program that filters need anyway.
+            white = tuple(ARFilter(np.zeros(0), 1.0) for _ in last.diagnosis.noise)
+            method = dataclasses.replace(self.whitened_method(last.diagnosis), filters=white)
+            return [*found, fit(found[0], self.recordings, method).loop]
+        held = _held_shapes(found[0])
+        plain = dataclasses.replace(_quiet(self.method), start="given")
+        return found + [
+            fit(grown(effect.scaled(factor)).free(*held), self.recordings, plain).loop
+            for factor in (1.0, wide)
+        ]
 
     def settled(self, best: Contender, say: Callable[[str], None]) -> Contender:
         """The best contender with noise filters of its own, and its held shapes if they matter.

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..effects import AbstractTransmission, Motion
 from ..loop import ClosedLoop
-from ..simulate import SIGNALS, Batch, Interval, advance, each, initial, run
+from ..simulate import SIGNALS, Batch, Interval, advance, each, initial, run, with_rolled_stages
 
 Place = Literal["push", "noise", "rate", "pull"]
 
@@ -43,6 +43,7 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
 
     - `output`: which of `SIGNALS` is compared.
     """
+    loop = with_rolled_stages(loop)
     n, theta, row = loop.joints, loop.theta, SIGNALS.index(output)
     p = theta.shape[0]
     parted = any(isinstance(effect, AbstractTransmission) for effect in loop.effects)

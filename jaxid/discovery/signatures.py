@@ -17,7 +17,7 @@ from ..loop import ClosedLoop, effect_loads
 from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..recording import Recordings
 from ..sharding import at_once
-from ..simulate import Batch, each, initial, run
+from ..simulate import Batch, each, initial, run, with_rolled_stages
 from .linear import Linearised, respond
 
 
@@ -253,6 +253,7 @@ def _finite(
     loop: ClosedLoop, stacked: AbstractEffect, batch: Batch, row: int
 ) -> Float[Array, "recordings points joints settings"]:
     """One signal of simulations with an effect, at all its settings."""
+    loop = with_rolled_stages(loop)
 
     def one(effect, intervals, q0, v0):
         grown = loop.add(effect)

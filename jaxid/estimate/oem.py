@@ -327,9 +327,9 @@ def _taps(filters: Noise, weights: Float[Array, " outputs"]) -> Float[np.ndarray
     w = np.asarray(weights)
     if isinstance(filters, VectorAR):
         scale = np.outer(w, 1 / w)[..., None]
-        return scale * filters.taps(16 * (filters.order // 16 + 1))
+        return scale * filters.taps(32 * (filters.order // 32 + 1))
     longest = max((f.order for f in filters or ()), default=0)
-    size = 16 * (longest // 16 + 1)
+    size = 32 * (longest // 32 + 1)
     white = ARFilter(np.zeros(0), 1.0)
     return np.stack([f.taps(size) for f in filters or [white] * len(w)])
 

@@ -1,0 +1,5 @@
+"""`python -m jaxid` is the command `jaxid`."""
+
+from .cli import main
+
+main()
