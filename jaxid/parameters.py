@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -131,6 +132,14 @@ def list_parameters(model: Any) -> tuple[Parameter, ...]:
     The name is the symbol followed by the owner's joint, if it has one; when two would be the
     same, the later gets `_2`, `_3` and so on.
     """
+    leaves, structure = jax.tree.flatten(model)
+    return _listed(structure, tuple(np.shape(leaf) for leaf in leaves))
+
+
+@lru_cache(maxsize=1024)
+def _listed(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Parameter, ...]:
+    """The parameters of modules of one structure: a fit asks for them dozens of times."""
+    model = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(s, float) for s in shapes])
     found: list[Parameter] = []
     taken: dict[str, int] = {}
     for owner, field, where in _declared(model, ()):
@@ -143,9 +152,9 @@ def list_parameters(model: Any) -> tuple[Parameter, ...]:
         taken[name] = taken.get(name, 0) + 1
         if taken[name] > 1:
             name = f"{name}_{taken[name]}"
-        size = math.prod(value.shape) if hasattr(value, "shape") else 1
-        several = bool(getattr(value, "shape", ()))
-        found.append(Parameter(name, declaration, where, joint, size, several))
+        found.append(
+            Parameter(name, declaration, where, joint, math.prod(value.shape), bool(value.shape))
+        )
     return tuple(found)
 
 
