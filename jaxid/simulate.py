@@ -480,7 +480,11 @@ def simulate(
     """
     recordings = Recordings.of(recordings)
     loop = with_substeps(loop, recordings)
-    together = simulate_batch(loop, prepare(loop, recordings, noise))
+    return separate(simulate_batch(loop, prepare(loop, recordings, noise)), recordings)
+
+
+def separate(together: Simulated, recordings: Recordings) -> tuple[Simulated, ...]:
+    """The runs of a batch one by one, each with its recording's samples."""
     return tuple(
         jax.tree.map(lambda leaf, k=k, r=r: leaf[k, : r.samples], together)
         for k, r in enumerate(recordings)

@@ -44,6 +44,20 @@ def test_at_the_truth_the_error_is_the_noise(case, loop, recordings):
     assert [len(r) for r in found.residuals] == [801, 600]
 
 
+@pytest.mark.parametrize("held", [False, True], ids=["free", "nothing free"])
+def test_a_recording_in_motion_is_held_against_the_best_start(case, loop, held):
+    r = case.recordings["fit_1"]
+    whole = jaxid.Recording.from_arrays(r["time"], r["q"], r["tau"], q_ref=r["q_ref"], name="x")
+    moving = whole.slice(1.0, 6.0)
+    # By the encoder alone, whose steps say little of a velocity.
+    assert np.abs(r["v_true"][100]).max() > 0.1
+    here = slice(100, 100 + moving.samples)
+    noise = (r["tau"] - r["tau_true"])[here]
+    floor = 100 * np.linalg.norm(noise, axis=0) / np.linalg.norm(r["tau"][here], axis=0)
+    found = jaxid.compare(loop.hold(*loop.names) if held else loop, moving)
+    assert np.abs(found.error_percent.to_numpy()[0] / floor - 1).max() < 1e-2
+
+
 def test_errors_are_the_papers_relative_ones(loop, recordings):
     found = jaxid.compare(loop.with_values(ZZ1r=4.5), recordings)
     for recording, run in zip(recordings, found.runs, strict=True):

@@ -18,13 +18,22 @@ from ..errors import FitError, RecordingError
 from ..estimate import Filtering, Fit
 from ..estimate._base import errors_to_dict, joint_columns, relative_errors
 from ..estimate._regression import filtered
-from ..estimate.oem import pieces_of
+from ..estimate.oem import from_best_starts, pieces_of
 from ..loop import ClosedLoop
 from ..noise import autocorrelation
 from ..recording import Recording, Recordings
 from ..saved import save
 from ..showing import AbstractShown
-from ..simulate import Simulated, band_of, compared, simulate
+from ..simulate import (
+    Simulated,
+    band_of,
+    compared,
+    prepare,
+    separate,
+    simulate,
+    simulate_batch,
+    with_substeps,
+)
 
 
 class Comparison(AbstractShown):
@@ -176,6 +185,8 @@ def compare(
 ) -> Comparison:
     """Simulates a model along recordings and holds it against what was measured.
 
+    Recordings that do not start at rest do so at the state from which the model does best.
+
     **Arguments:**
 
     - `model`: a fit or a loop.
@@ -204,7 +215,9 @@ def _simulate_in_windows(
     loop: ClosedLoop, recordings: Recordings, window: float | None
 ) -> tuple[Simulated, ...]:
     if window is None:
-        return simulate(loop, recordings)
+        loop = with_substeps(loop, recordings)
+        batch = from_best_starts(loop, recordings, prepare(loop, recordings))
+        return separate(simulate_batch(loop, batch), recordings)
     runs = []
     for recording in recordings:
         pieces = pieces_of(Recordings.of(recording), window)

@@ -423,11 +423,12 @@ def products(
 def _sums(residual: Any, jacobian: Any, by_start: Any, free: Any) -> tuple[Any, ...]:
     """Squared error, and the products of `Point` in their order; of NumPy's arrays or JAX's."""
     count, p = free.shape[0], jacobian.shape[-1]
-    r, j = residual.reshape(count, -1), jacobian.reshape(count, -1, p)
+    r = residual.reshape(count, -1)
+    j = jacobian.reshape(*r.shape, p)
     s = j[..., :0]
     if by_start is not None:
         s = by_start.reshape(*j.shape[:2], -1) * free[:, None, None]
-    flat, across = j.reshape(-1, p), s.swapaxes(1, 2)
+    flat, across = j.reshape(r.size, p), s.swapaxes(1, 2)
     return (
         (r**2).sum(),
         flat.T @ flat,

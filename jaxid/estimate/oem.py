@@ -252,6 +252,27 @@ def _free_starts(
     return np.array([0.0 if at_rest(piece) else 1.0 for piece in pieces])
 
 
+def from_best_starts(loop: ClosedLoop, recordings: Recordings, batch: Batch) -> Batch:
+    """The batch with initial states at which the loop does best; those of recordings at rest stay.
+
+    A recording that starts in motion, or that sensors which are off set in motion at once, tells
+    its first velocity badly; a fit estimates it, and what is held against a fit must as well.
+    """
+    method = OEM()
+    signals, free = _signals(method, loop), _free_starts(method, tuple(recordings), batch)
+    if not free.any():
+        return batch
+    weights = jnp.asarray(_first_weights(loop, tuple(recordings), signals))
+    noise = jnp.asarray(_taps(None, weights))
+    # Parameters stay where they are: between bounds that leave them no room.
+    at, own = loop.theta, jnp.asarray(free)
+    problem = Problem(loop, batch, weights, noise, own, at, at, signals, True)
+    start = jnp.concatenate([batch.q0, batch.v0], axis=1)
+    found = minimise(problem, at, start, method.tolerance, 1e-4, 20, lambda _: None)
+    best, n = found.point.start, loop.joints
+    return dataclasses.replace(batch, q0=best[:, :n], v0=best[:, n:])
+
+
 def _first_weights(
     loop: ClosedLoop, pieces: Sequence[Recording], signals: tuple[str, ...]
 ) -> Float[np.ndarray, " outputs"]:
