@@ -480,11 +480,11 @@ def simulate(
     """
     recordings = Recordings.of(recordings)
     loop = with_substeps(loop, recordings)
-    return separate(simulate_batch(loop, prepare(loop, recordings, noise)), recordings)
+    return by_recording(simulate_batch(loop, prepare(loop, recordings, noise)), recordings)
 
 
-def separate(together: Simulated, recordings: Recordings) -> tuple[Simulated, ...]:
-    """The runs of a batch one by one, each with its recording's samples."""
+def by_recording(together: Simulated, recordings: Recordings) -> tuple[Simulated, ...]:
+    """The runs of a batch, `(recordings, samples, ...)`, one by one with their own samples."""
     return tuple(
         jax.tree.map(lambda leaf, k=k, r=r: leaf[k, : r.samples], together)
         for k, r in enumerate(recordings)
@@ -532,9 +532,11 @@ def with_rolled_stages(loop: ClosedLoop) -> ClosedLoop:
     Written out, as a lone simulation likes them best, four stages of all tangents are more than
     the registers and first cache of a core hold: half as fast, and longer to compile.
     """
-    if not isinstance(loop.stepping.solver, RK4):
+    solver = loop.stepping.solver
+    if not isinstance(solver, RK4):
         return loop
-    stepping = dataclasses.replace(loop.stepping, solver=RK4(rolled=True))
+    rolled = dataclasses.replace(solver, rolled=True)
+    stepping = dataclasses.replace(loop.stepping, solver=rolled)
     return dataclasses.replace(loop, stepping=stepping)
 
 

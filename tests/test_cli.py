@@ -1,6 +1,8 @@
 """`jaxid fit`, `jaxid compare` and `jaxid demo`; `jaxid discover` has a file of its own."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pandas as pd
@@ -211,3 +213,9 @@ def test_help_has_examples_and_exit_codes(command):
 def test_colours_are_for_terminals_that_want_them(fitted):
     result, _ = fitted
     assert "\x1b" not in result.stdout + result.stderr
+
+
+def test_the_package_is_the_command_too():
+    ran = subprocess.run([sys.executable, "-m", "jaxid", "--help"], capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    assert "discover" in ran.stdout

@@ -58,6 +58,15 @@ def test_a_recording_in_motion_is_held_against_the_best_start(case, loop, held):
     assert np.abs(found.error_percent.to_numpy()[0] / floor - 1).max() < 1e-2
 
 
+def test_a_fit_that_trusts_the_first_sample_is_compared_from_it(case, loop):
+    r = case.recordings["fit_1"]
+    whole = jaxid.Recording.from_arrays(r["time"], r["q"], r["tau"], q_ref=r["q_ref"], name="x")
+    moving = whole.slice(1.0, 6.0)
+    fit = jaxid.fit(loop, moving, jaxid.OEM(initial="rest", start="given", progress=False))
+    (run,) = jaxid.simulate(fit.loop, moving)
+    np.testing.assert_array_equal(jaxid.compare(fit, moving).runs[0].tau, run.tau)
+
+
 def test_errors_are_the_papers_relative_ones(loop, recordings):
     found = jaxid.compare(loop.with_values(ZZ1r=4.5), recordings)
     for recording, run in zip(recordings, found.runs, strict=True):

@@ -18,7 +18,7 @@ from ..errors import FitError, RecordingError
 from ..estimate import Filtering, Fit
 from ..estimate._base import errors_to_dict, joint_columns, relative_errors
 from ..estimate._regression import filtered
-from ..estimate.oem import from_best_starts, pieces_of
+from ..estimate.oem import OEM, from_best_starts, oem_of, pieces_of
 from ..loop import ClosedLoop
 from ..noise import autocorrelation
 from ..recording import Recording, Recordings
@@ -27,9 +27,9 @@ from ..showing import AbstractShown
 from ..simulate import (
     Simulated,
     band_of,
+    by_recording,
     compared,
     prepare,
-    separate,
     simulate,
     simulate_batch,
     with_substeps,
@@ -185,7 +185,8 @@ def compare(
 ) -> Comparison:
     """Simulates a model along recordings and holds it against what was measured.
 
-    Recordings that do not start at rest do so at the state from which the model does best.
+    Recordings that do not start at rest do so at the state from which the model does best, unless
+    the fit trusted the first sample (`OEM(initial="rest")`).
 
     **Arguments:**
 
@@ -201,7 +202,7 @@ def compare(
     recordings = Recordings.of(recordings)
     if window is None and isinstance(model, Fit):
         window = getattr(model.method, "window", None)
-    runs = _simulate_in_windows(loop, recordings, window)
+    runs = _simulate_in_windows(oem_of(model), loop, recordings, window)
     for run, recording in zip(runs, recordings, strict=True):
         if not np.isfinite(run.tau).all() or not np.isfinite(run.q).all():
             raise FitError(
@@ -212,12 +213,12 @@ def compare(
 
 
 def _simulate_in_windows(
-    loop: ClosedLoop, recordings: Recordings, window: float | None
+    method: OEM, loop: ClosedLoop, recordings: Recordings, window: float | None
 ) -> tuple[Simulated, ...]:
     if window is None:
         loop = with_substeps(loop, recordings)
-        batch = from_best_starts(loop, recordings, prepare(loop, recordings))
-        return separate(simulate_batch(loop, batch), recordings)
+        batch = from_best_starts(method, loop, recordings, prepare(loop, recordings))
+        return by_recording(simulate_batch(loop, batch), recordings)
     runs = []
     for recording in recordings:
         pieces = pieces_of(Recordings.of(recording), window)

@@ -17,8 +17,8 @@ from .. import figures
 from ..effects import AbstractEffect, Curve, Motion, Scene
 from ..effects import catalogue as known
 from ..errors import FitError, ModelError
-from ..estimate import OEM, Fit
-from ..estimate.oem import _free_starts, _signals, pieces_of
+from ..estimate import Fit
+from ..estimate.oem import _free_starts, _signals, oem_of, pieces_of
 from ..loop import ClosedLoop
 from ..noise import ARFilter
 from ..parameters import write_values
@@ -401,9 +401,7 @@ def diagnose(
 
 def _as_fitted(fit: Fit | Comparison, loop: ClosedLoop) -> tuple[str, Batch, np.ndarray]:
     """Which output is compared, the batch, and which initial states are free, as in the fit."""
-    method = getattr(fit, "method", None)
-    method = getattr(method, "oem", method)
-    method = method if isinstance(method, OEM) else OEM()
+    method = oem_of(fit)
     pieces = pieces_of(fit.recordings, method.window)
     batch = prepare(loop, pieces)
     return _signals(method, loop)[0], batch, _free_starts(method, pieces, batch)

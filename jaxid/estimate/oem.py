@@ -252,13 +252,19 @@ def _free_starts(
     return np.array([0.0 if at_rest(piece) else 1.0 for piece in pieces])
 
 
-def from_best_starts(loop: ClosedLoop, recordings: Recordings, batch: Batch) -> Batch:
-    """The batch with initial states at which the loop does best; those of recordings at rest stay.
+def oem_of(fit: object) -> OEM:
+    """The output error that a fit's method is or builds on; that of defaults where it has none."""
+    method = getattr(fit, "method", None)
+    method = getattr(method, "oem", method)
+    return method if isinstance(method, OEM) else OEM()
+
+
+def from_best_starts(method: OEM, loop: ClosedLoop, recordings: Recordings, batch: Batch) -> Batch:
+    """The batch with initial states at which the loop does best, where the method estimates them.
 
     A recording that starts in motion, or that sensors which are off set in motion at once, tells
     its first velocity badly; a fit estimates it, and what is held against a fit must as well.
     """
-    method = OEM()
     signals, free = _signals(method, loop), _free_starts(method, tuple(recordings), batch)
     if not free.any():
         return batch
