@@ -1,6 +1,8 @@
 """Recordings shared out: over the cores of this machine, or over the devices of a mesh."""
 
+import math
 import os
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -10,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Int, PyTree
+from jaxtyping import Array, Int, PyTree
 
 Given = TypeVar("Given")
 Result = TypeVar("Result")
@@ -52,10 +54,39 @@ def taken(each: PyTree, rows: Int[np.ndarray, " rows"]) -> PyTree:
     return jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[rows], each))
 
 
-def end_to_end(parts: Sequence[Result], count: int) -> Result:
-    """The leading axes of all leaves put together again, without what filled up the last part."""
-    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
-    return jax.device_put(joined)
+class EndToEnd:
+    """Room for the leaves of all parts, which lie end to end along their leading axes.
+
+    Parts are put in place as they come, so that what is large is neither held nor copied twice.
+    """
+
+    def __init__(self, parts: int):
+        self._parts = parts
+        self._room: PyTree = None
+        self._lock = threading.Lock()
+
+    def put(self, part: int, result: PyTree) -> None:
+        """Takes the result of one part; every part has leaves of the same shapes."""
+        with self._lock:
+            if self._room is None:
+                self._room = jax.tree.map(self._room_for, result)
+
+        def place(room, leaf):
+            room[part * len(leaf) : (part + 1) * len(leaf)] = leaf
+
+        jax.tree.map(place, self._room, result)
+
+    def _room_for(self, leaf: Array) -> np.ndarray:
+        # JAX takes over memory as it is where it begins at a multiple of 64 bytes.
+        shape = (self._parts * leaf.shape[0], *leaf.shape[1:])
+        size = leaf.dtype.itemsize * math.prod(shape)
+        held = np.empty(size + 64, np.uint8)
+        begin = -held.ctypes.data % 64
+        return held[begin : begin + size].view(leaf.dtype).reshape(shape)
+
+    def whole(self, count: int) -> PyTree:
+        """The first `count` rows of every leaf: what filled up the last part is left out."""
+        return jax.device_put(jax.tree.map(lambda room: room[:count], self._room))
 
 
 def everywhere(tree: PyTree, mesh: Mesh) -> PyTree:

@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float, Int
 from ..lapack import column_basis
 from ..loop import ClosedLoop
 from ..sharding import (
+    EndToEnd,
     at_once,
     cores,
-    end_to_end,
     everywhere,
     of_this_machine,
     shared_out,
@@ -346,22 +346,41 @@ def linearisation(problem: Problem) -> Callable[[Array, Array], Point]:
     problem = dataclasses.replace(problem, mesh=None)
     threads = cores() if mesh is None else mesh.size
     recordings, samples = problem.batch.mask.shape
-    shares = shares_of(recordings, threads if recordings * samples > _WORTH_SHARING else 1)
+    if recordings * samples <= _WORTH_SHARING:
+        threads = 1
+    rounds = -(-recordings * samples // (threads * _AT_A_TIME))
+    shares = shares_of(recordings, threads * rounds)
     if len(shares) == 1:
         return lambda theta, start: point_around(problem, theta, start)
-    parts = [_share(problem, rows) for rows in shares]
-
-    def around(theta: Array, start: Array) -> Point:
-        starts = [taken(start, rows) for rows in shares]
-        given = list(zip(parts, starts, strict=True))
-        points = at_once(lambda one: point_around(one[0], theta, one[1]), given)
-        return _together(points, start)
-
-    return around
+    return _Shared([_share(problem, rows) for rows in shares], shares)
 
 
 # Samples in all from which on threads gain more than they cost.
 _WORTH_SHARING = 3000
+# Samples of one share: intermediate results of more would be fresh memory each time.
+_AT_A_TIME = 40_000
+
+
+class _Shared(eqx.Module):
+    """The linearisation of all recordings by shares, which cores take in turn."""
+
+    parts: list[Problem]
+    rows: list[Int[np.ndarray, " rows"]]
+
+    def __call__(
+        self, theta: Float[Array, " parameters"], start: Float[Array, "recordings initials"]
+    ) -> Point:
+        found = EndToEnd(len(self.parts))
+
+        def part(k: int) -> tuple[Array, ...]:
+            point = point_around(self.parts[k], theta, taken(start, self.rows[k]))
+            found.put(k, (point.found, point.start_gram, point.start_slope, point.cross))
+            return point.loss, point.gram, point.slope
+
+        sums = at_once(part, range(len(self.parts)))
+        by_recording, *products = found.whole(start.shape[0])
+        loss, gram, slope = (jnp.asarray(np.sum(x, axis=0)) for x in zip(*sums, strict=True))
+        return Point(theta, start, by_recording, loss, gram, slope, *products)
 
 
 def _over_mesh(problem: Problem, mesh: Mesh, theta: Array, start: Array) -> Point:
@@ -378,16 +397,6 @@ def _share(problem: Problem, rows: Int[np.ndarray, " rows"]) -> Problem:
         kept = dataclasses.replace(batch.band, keep=batch.band.keep & new)
         batch = dataclasses.replace(batch, band=kept)
     return dataclasses.replace(problem, batch=batch, free=free)
-
-
-def _together(points: Sequence[Point], start: Float[Array, "recordings initials"]) -> Point:
-    """The linearisation of all recordings, of those of their shares."""
-    by_recording = [(p.found, p.start_gram, p.start_slope, p.cross) for p in points]
-    found, start_gram, start_slope, cross = end_to_end(by_recording, start.shape[0])
-    sums = [(p.loss, p.gram, p.slope) for p in points]
-    loss, gram, slope = jax.tree.map(lambda *x: jnp.asarray(np.sum(x, axis=0)), *sums)
-    theta = points[0].theta
-    return Point(theta, start, found, loss, gram, slope, start_gram, start_slope, cross)
 
 
 @eqx.filter_jit
