@@ -475,7 +475,8 @@ def _judge(
     significance: float,
 ) -> Diagnosis:
     blocks = [h.columns for h in hypotheses]
-    noise, picked = estimate_noise(data, blocks)
+    apart = estimate_noise(data, blocks)
+    data, noise = apart.data, apart.noise
     gram = Gram.of(data, noise)
     tests = effective_tests(gram, blocks)
     ranking: dict[tuple[Any, ...], Verdict] = {}
@@ -489,7 +490,7 @@ def _judge(
             continue
         _keep_better(ranking, verdict.key, verdict)
         _keep_better(forms, (*verdict.key, type(effect)), verdict)
-    columns = columns_of(blocks, picked)
+    columns = columns_of(blocks, apart.chosen)
     best = tuple(sorted(ranking.values(), key=_order, reverse=True))
     curves = tuple(sorted(where.values(), key=_order, reverse=True))
     return Diagnosis(

@@ -18,17 +18,31 @@ class Data(eqx.Module):
 
     `base` are the columns that the model's own parameters and initial states can absorb, `table`
     the signatures, `mask` says which samples are there. Signatures are of single precision: they
-    are many, and to be told from noise they need three digits.
+    are many, and to be told from noise they need three digits. `level` is how loud noise is in each
+    recording beside the mean of all; None where they are alike.
     """
 
     residual: Rows
     base: Float[np.ndarray, "recordings samples outputs absorbed"]
     table: Float[np.ndarray, "recordings samples outputs columns"]
     mask: Bool[np.ndarray, "recordings samples"]
+    level: Float[np.ndarray, "recordings outputs"] | None = None
 
     def series(self, rows: Rows, output: int) -> list[np.ndarray]:
-        """One output's rows, one series a recording."""
-        return [r[m, output] for r, m in zip(rows, self.mask, strict=True)]
+        """One output's rows, one series a recording, all at the same level of noise."""
+        alike = np.ones((len(rows), rows.shape[2])) if self.level is None else self.level
+        pairs = zip(rows, self.mask, alike[:, output], strict=True)
+        return [r[m, output] / level for r, m, level in pairs]
+
+    def white(
+        self, x: Float[np.ndarray, "recordings samples outputs *columns"], noise: Sequence[ARFilter]
+    ) -> Float[np.ndarray, "recordings samples outputs *columns"]:
+        """Rows through the inverse of the noise filters, all at the same level of noise."""
+        out = whitened(x, noise, self.mask)
+        if self.level is not None:
+            level = self.level.astype(x.dtype)[:, None]
+            out /= level.reshape(*level.shape, *(1,) * (x.ndim - 3))
+        return out
 
 
 def whitened(
@@ -86,9 +100,9 @@ class Whitened(eqx.Module):
     @classmethod
     def of(cls, data: Data, noise: Sequence[ARFilter]) -> "Whitened":
         """The problem of some data, through noise filters."""
-        r = whitened(data.residual, noise, data.mask).reshape(-1)
-        z = whitened(data.base, noise, data.mask).reshape(len(r), -1)
-        x = whitened(data.table, noise, data.mask).reshape(len(r), -1)
+        r = data.white(data.residual, noise).reshape(-1)
+        z = data.white(data.base, noise).reshape(len(r), -1)
+        x = data.white(data.table, noise).reshape(len(r), -1)
         size = np.sqrt(np.einsum("rc,rc->c", x, x))
         size[size == 0] = 1.0
         x /= size

@@ -1,16 +1,30 @@
 """Noise told apart from physics: its filters are estimated with every effect in the model."""
 
+import dataclasses
 from collections.abc import Sequence
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from ..noise import ARFilter, fit_ar
-from .score import WEAK, Blocks, Data, Rows, Whitened, by_width, explained_by, whitened
+from .score import WEAK, Blocks, Data, Rows, Whitened, by_width, explained_by
 
 
-def estimate_noise(data: Data, blocks: Blocks) -> tuple[tuple[ARFilter, ...], list[int]]:
-    """The noise filters, one an output, and the blocks that were picked to leave noise alone.
+class Separated(eqx.Module):
+    """Noise told apart: its filters, one an output, and the blocks picked to leave it alone.
+
+    `data` has the level of noise of each recording; `bic` is of filters, levels and blocks.
+    """
+
+    data: Data
+    noise: tuple[ARFilter, ...]
+    chosen: list[int]
+    bic: float
+
+
+def estimate_noise(data: Data, blocks: Blocks) -> Separated:
+    """The noise filters and levels, and the blocks that were picked to leave noise alone.
 
     Two starts: what the base leaves, whose filter may take a spring's slow pull for noise, and what
     the base and the blocks that matter most to plain least squares leave, which have taken a share
@@ -22,20 +36,17 @@ def estimate_noise(data: Data, blocks: Blocks) -> tuple[tuple[ARFilter, ...], li
         for j in range(data.residual.shape[2])
     )
     plain = leftover(data, flat, ())
-    level = noise_of(data, plain, data.base.shape[-1], highest=0)
-    rich = columns_of(blocks, select(Whitened.of(data, level), blocks))
-    ends = [_settle(data, blocks, noise_of(data, plain, 0.0))]
+    white = noise_of(data, plain, data.base.shape[-1], highest=0)
+    rich = columns_of(blocks, select(Whitened.of(data, white), blocks))
+    ends = [_settle(*levelled(data, plain, 0.0), blocks)]
     if rich:
-        start = leftover(data, level, rich)
-        ends.append(_settle(data, blocks, noise_of(data, start, len(rich))))
-    _, noise, chosen = min(ends, key=lambda end: end[0])
-    return noise, chosen
+        start = leftover(data, white, rich)
+        ends.append(_settle(*levelled(data, start, len(rich)), blocks))
+    return min(ends, key=lambda end: end.bic)
 
 
-def _settle(
-    data: Data, blocks: Blocks, noise: tuple[ARFilter, ...]
-) -> tuple[float, tuple[ARFilter, ...], list[int]]:
-    """Picks signatures and estimates the filter in turn; BIC, filters and blocks at the end."""
+def _settle(data: Data, noise: tuple[ARFilter, ...], blocks: Blocks) -> Separated:
+    """Picks signatures and estimates the filter in turn."""
     chosen: list[int] = []
     columns: list[int] = []
     for _ in range(2):
@@ -43,13 +54,17 @@ def _settle(
         chosen = select(Whitened.of(data, noise), blocks)
         columns = columns_of(blocks, chosen)
         rest = leftover(data, noise, columns)
-        noise = noise_of(data, rest, data.base.shape[-1] + len(columns))
+        data, noise = levelled(data, rest, data.base.shape[-1] + len(columns))
         if chosen == before:
             break
-    count = float(data.mask.sum())
-    spread = sum(count * np.log(f.variance) for f in noise)
+    size = data.mask.sum(axis=1)
+    spread = sum(size.sum() * np.log(f.variance) for f in noise)
     free = len(columns) + sum(f.order for f in noise)
-    return float(spread + free * np.log(count * len(noise))), noise, chosen
+    if data.level is not None:
+        spread += 2 * float(size @ np.log(data.level).sum(axis=1))
+        free += (len(size) - 1) * np.sum(np.any(data.level != 1, axis=0))
+    bic = float(spread + free * np.log(size.sum() * len(noise)))
+    return Separated(data, noise, chosen, bic)
 
 
 def columns_of(blocks: Blocks, chosen: Sequence[int]) -> list[int]:
@@ -77,12 +92,36 @@ def noise_of(data: Data, rows: Rows, lost: float, highest: int = 30) -> tuple[AR
     return tuple(filters)
 
 
+def levelled(data: Data, rows: Rows, lost: float) -> tuple[Data, tuple[ARFilter, ...]]:
+    """The data with the level of noise of each recording, and the filters of all.
+
+    An output has levels where its recordings differ by more than chance (BIC): a motion that is
+    slow and one that is fast need not have the same noise, and to pool them would make p-values of
+    what acts in the louder one too small.
+
+    **Arguments:** as for `noise_of`.
+    """
+    data = dataclasses.replace(data, level=None)
+    noise = noise_of(data, rows, lost)
+    white = data.white(rows, noise)
+    count = data.mask.sum(axis=1)[:, None] - np.array([f.order for f in noise])
+    power = np.sum(white**2, axis=1) / count
+    mean = np.sum(count * power, axis=0) / count.sum(axis=0)
+    ratio = np.maximum(power / np.where(mean > 0, mean, 1.0), 1e-4)
+    gain = -np.sum(count * np.log(ratio), axis=0)
+    differ = (mean > 0) & (gain > (len(ratio) - 1) * np.log(count.sum(axis=0)))
+    if not differ.any():
+        return data, noise
+    data = dataclasses.replace(data, level=np.sqrt(np.where(differ, ratio, 1.0)))
+    return data, noise_of(data, rows, lost)
+
+
 def leftover(data: Data, noise: Sequence[ARFilter], columns: Sequence[int]) -> Rows:
     """The residual less the best combination of base and some signatures, whitened by `noise`."""
     picked = data.table[..., list(columns)].astype(float)
     wide = np.concatenate([data.base, picked], axis=-1)
-    w = whitened(wide, noise, data.mask).reshape(-1, wide.shape[-1])
-    r = whitened(data.residual, noise, data.mask).reshape(-1)
+    w = data.white(wide, noise).reshape(-1, wide.shape[-1])
+    r = data.white(data.residual, noise).reshape(-1)
     size = np.linalg.norm(w, axis=0)
     size[size == 0] = 1.0
     w /= size

@@ -1,0 +1,67 @@
+"""Noise told apart from physics: p-values where recordings are not alike."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+from jaxid.discovery.score import Data, Gram, chance
+from jaxid.discovery.separate import estimate_noise
+
+SAMPLES, DRAWS = 300, 80
+TIME = np.linspace(0, 1, SAMPLES)
+
+
+def drawn(rng: np.random.Generator, levels: tuple[float, ...]) -> Data:
+    """Coloured noise of several levels; signatures that act in the last recording alone."""
+    noise = [
+        level * lfilter([1.0], [1.0, -0.8], rng.standard_normal(SAMPLES + 200))[200:]
+        for level in levels
+    ]
+    base = np.stack([np.sin(7 * TIME), np.cos(11 * TIME), TIME], axis=1)
+    table = np.zeros((len(levels), SAMPLES, 1, 4))
+    table[-1, :, 0] = np.stack([np.sin(k * TIME) for k in (3, 23, 61, 97)], axis=1)
+    return Data(
+        np.stack(noise)[..., None],
+        np.stack([base] * len(levels))[:, :, None],
+        table.astype(np.float32),
+        np.ones((len(levels), SAMPLES), bool),
+    )
+
+
+def p_value(data: Data, noise: tuple) -> float:
+    explained, freedom = Gram.of(data, noise).explained([(0, 1, 2, 3)])
+    return chance(float(explained[0]), int(freedom[0]))
+
+
+@pytest.mark.parametrize("levels", [(1.0, 1.0), (1.0, 3.0)])
+def test_p_values_are_true_where_recordings_have_levels_of_their_own(levels):
+    rng = np.random.default_rng(11)
+    own, pooled, apart = [], [], 0
+    for _ in range(DRAWS):
+        found = estimate_noise(drawn(rng, levels), [(0,), (1,), (2,), (3,)])
+        own.append(p_value(found.data, found.noise))
+        pooled.append(p_value(dataclasses.replace(found.data, level=None), found.noise))
+        apart += found.data.level is not None
+    low, high = binom.interval(0.999, DRAWS, 0.05)
+    assert low <= np.sum(np.array(own) < 0.05) <= high
+    if len(set(levels)) == 1:
+        assert apart <= 0.05 * DRAWS
+    else:
+        assert apart == DRAWS
+        # What the levels are for: without them the louder recording cries wolf.
+        assert np.sum(np.array(pooled) < 0.05) > high
+
+
+def test_levels_are_those_of_the_noise():
+    found = estimate_noise(drawn(np.random.default_rng(12), (2.0, 1.0, 4.0)), [(0, 1)])
+    assert np.allclose(found.data.level[:, 0], np.array([2.0, 1.0, 4.0]) / np.sqrt(7), rtol=0.1)
+    assert np.isclose(found.noise[0].variance, 7.0, rtol=0.1)
+
+
+def test_a_recording_without_noise_is_no_division_by_zero():
+    data = drawn(np.random.default_rng(13), (0.0, 1.0))
+    found = estimate_noise(data, [(0,), (1,)])
+    assert np.isfinite(Gram.of(found.data, found.noise).gram).all()
