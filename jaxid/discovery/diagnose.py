@@ -475,7 +475,7 @@ def _judge(
     significance: float,
 ) -> Diagnosis:
     blocks = [h.columns for h in hypotheses]
-    apart = estimate_noise(data, blocks)
+    apart = estimate_noise(data, blocks, alike=len(data.residual) != len(fit.recordings))
     data, noise = apart.data, apart.noise
     gram = Gram.of(data, noise)
     tests = effective_tests(gram, blocks)

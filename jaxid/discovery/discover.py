@@ -110,10 +110,15 @@ def _notes(steps: Sequence[Step], most: int) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _fitted_criterion(found: Fit, noise: Sequence[ARFilter]) -> float:
+def _fitted_criterion(found: Fit, diagnosis: Diagnosis) -> float:
     """Whitened squared error on fitted recordings, and BIC's price."""
     count = sum(r.size for r in found.residuals)
-    return _whitened_error(found.residuals, noise) + len(found.names) * float(np.log(count))
+    return _fitted_error(found, diagnosis) + len(found.names) * float(np.log(count))
+
+
+def _fitted_error(found: Fit, diagnosis: Diagnosis) -> float:
+    """Whitened squared error on fitted recordings."""
+    return _whitened_error(found.residuals, diagnosis.noise, diagnosis.data.level)
 
 
 def _series_note(steps: Sequence[Step]) -> str:
@@ -222,7 +227,7 @@ class _Search(eqx.Module):
         steps = list(before)
         while contenders and len(steps) < len(before) + longest:
             last = steps[-1]
-            if contenders[0].criterion >= self.criterion(last.fit, last.diagnosis.noise):
+            if contenders[0].criterion >= self.criterion(last.fit, last.diagnosis):
                 break
             steps.append(self.grown(last, contenders, say))
             matters = self.matters(steps, share)
@@ -258,9 +263,8 @@ class _Search(eqx.Module):
             if isinstance(v.hypothesis.effect, AbstractTransmission)
         ]
         contenders = self.refit(first, apart, say)
-        noise = last.diagnosis.noise
-        kept = self.criterion(last.fit, noise)
-        better = [c for c in contenders if self.criterion(c.fit, noise) < kept]
+        kept = self.criterion(last.fit, last.diagnosis)
+        better = [c for c in contenders if self.criterion(c.fit, last.diagnosis) < kept]
         return self.grown(first, better, say) if better else None
 
     def matters(self, steps: Sequence[Step], share: float = 1e-3) -> Callable[[Verdict], bool]:
@@ -272,9 +276,8 @@ class _Search(eqx.Module):
         if steps[-1].fit.error_percent.to_numpy().max() < 1e-3:
             # Recordings without noise: what is left is the integration's.
             return lambda v: False
-        noise = steps[-1].diagnosis.noise
-        gone = _whitened_error(steps[0].fit.residuals, noise)
-        gone -= _whitened_error(steps[-1].fit.residuals, noise)
+        gone = _fitted_error(steps[0].fit, steps[-1].diagnosis)
+        gone -= _fitted_error(steps[-1].fit, steps[-1].diagnosis)
         return lambda v: v.p_value < self.significance and v.explained > share * gone
 
     def convinces(self, contenders: Sequence[Contender], last: Step) -> bool:
@@ -284,7 +287,7 @@ class _Search(eqx.Module):
         """
         if not contenders:
             return False
-        gained = self.criterion(last.fit, last.diagnosis.noise) - contenders[0].criterion
+        gained = self.criterion(last.fit, last.diagnosis) - contenders[0].criterion
         if gained <= 0:
             return False
         pair = {v.key for v in last.diagnosis.pair}
@@ -324,9 +327,8 @@ class _Search(eqx.Module):
         say(f"refit with a curve on joint {top.hypothesis.joint}")
         grown = last.fit.loop.add(last.diagnosis.predicted(top))
         found = fit(grown, self.recordings, self.whitened_method(last.diagnosis))
-        return self.unseen_error(found, last.diagnosis.noise) < self.unseen_error(
-            last.fit, last.diagnosis.noise
-        )
+        before = self.unseen_error(last.fit, last.diagnosis)
+        return self.unseen_error(found, last.diagnosis) < before
 
     def refit(
         self, last: Step, leading: Sequence[Verdict], say: Callable[..., None]
@@ -339,7 +341,7 @@ class _Search(eqx.Module):
             tried = []
             for loop in self.starts(last, verdict):
                 refitted = fit(loop, self.recordings, self.whitened_method(last.diagnosis))
-                value = self.criterion(refitted, last.diagnosis.noise)
+                value = self.criterion(refitted, last.diagnosis)
                 if np.isfinite(value):
                     tried.append(Contender(*verdict.key, refitted, value))
             found += sorted(tried, key=_criterion)[:1]
@@ -402,22 +404,23 @@ class _Search(eqx.Module):
         method = dataclasses.replace(_quiet(self.method), start="given")
         return SeparablePEM(method, filters=diagnosis.noise)
 
-    def criterion(self, found: Fit, noise: Sequence[ARFilter]) -> float:
+    def criterion(self, found: Fit, diagnosis: Diagnosis) -> float:
         """Whitened squared error on fitted and held-out recordings, and BIC's price.
 
-        Less is better; a difference of ten is decisive. Infinite where the fit runs away.
+        Less is better; a difference of ten is decisive. Infinite where the fit runs away. Noise is
+        what the diagnosis takes for it.
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            value = _fitted_criterion(found, noise) + self.unseen_error(found, noise)
+            value = _fitted_criterion(found, diagnosis) + self.unseen_error(found, diagnosis)
         return value if np.isfinite(value) else np.inf
 
-    def unseen_error(self, found: Fit, noise: Sequence[ARFilter]) -> float:
+    def unseen_error(self, found: Fit, diagnosis: Diagnosis) -> float:
         """Whitened squared error on held-out recordings; infinite where the loop runs away."""
         if self.held_out is None:
             return 0.0
         try:
             with np.errstate(over="ignore", invalid="ignore"):
-                error = _whitened_error(_held_residuals(found, self.held_out), noise)
+                error = _whitened_error(_held_residuals(found, self.held_out), diagnosis.noise)
         except (ArithmeticError, ValueError, RuntimeError):
             return np.inf
         return error if np.isfinite(error) else np.inf
@@ -434,7 +437,7 @@ class _Search(eqx.Module):
         removed: list[tuple[str, int | None]] = []
         # Noise is estimated anew each time, so that two rivals might take turns for ever.
         for _ in range(2 * len(steps)):
-            final, kept = steps[-1], self.criterion(steps[-1].fit, steps[-1].diagnosis.noise)
+            final, kept = steps[-1], self.criterion(steps[-1].fit, steps[-1].diagnosis)
             tried = self.changed(steps, say)
             better, place, rival, found = min(
                 tried, key=lambda x: x[0], default=(np.inf, 0, None, final.fit)
@@ -468,7 +471,7 @@ class _Search(eqx.Module):
         for at, k in enumerate(added[:-1]):
             for rival in (None, *_rivals(steps[k])):
                 refitted = self.replaced(final, len(added) - at, rival, say)
-                value = self.criterion(refitted, final.diagnosis.noise)
+                value = self.criterion(refitted, final.diagnosis)
                 found.append((value, k, rival, refitted))
         return found
 
@@ -484,9 +487,9 @@ class _Search(eqx.Module):
         say(f"refit with a curve on joint {top.hypothesis.joint} in place of all effects")
         grown = steps[0].fit.loop.add(steps[0].diagnosis.predicted(top))
         found = fit(grown, self.recordings, self.whitened_method(last.diagnosis))
-        noise = last.diagnosis.noise
         # On fitted recordings alone: a curve says nothing of what lies beyond them.
-        return _fitted_criterion(found, noise) < _fitted_criterion(last.fit, noise)
+        kept = _fitted_criterion(last.fit, last.diagnosis)
+        return _fitted_criterion(found, last.diagnosis) < kept
 
     def replaced(
         self, final: Step, from_end: int, rival: Contender | None, say: Callable[[str], None]
@@ -671,11 +674,13 @@ def _held_residuals(found: Fit, held_out: Recordings) -> list[Float[np.ndarray, 
 
 
 def _whitened_error(
-    residuals: Sequence[Float[np.ndarray, "_samples joints"]], noise: Sequence[ARFilter]
+    residuals: Sequence[Float[np.ndarray, "_samples joints"]],
+    noise: Sequence[ARFilter],
+    level: Float[np.ndarray, "recordings joints"] | None = None,
 ) -> float:
-    """Squared error in units of the noise's innovations."""
+    """Squared error in units of the noise's innovations, of each recording's own if known."""
     total = 0.0
-    for r in residuals:
-        mask = np.ones((1, len(r)), bool)
-        total += float(np.sum(whitened(r[None], noise, mask) ** 2))
+    for k, r in enumerate(residuals):
+        white = whitened(r[None], noise, np.ones((1, len(r)), bool))
+        total += float(np.sum((white if level is None else white / level[k]) ** 2))
     return total

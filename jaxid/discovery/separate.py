@@ -23,13 +23,17 @@ class Separated(eqx.Module):
     bic: float
 
 
-def estimate_noise(data: Data, blocks: Blocks) -> Separated:
+def estimate_noise(data: Data, blocks: Blocks, alike: bool = False) -> Separated:
     """The noise filters and levels, and the blocks that were picked to leave noise alone.
 
     Two starts: what the base leaves, whose filter may take a spring's slow pull for noise, and what
     the base and the blocks that matter most to plain least squares leave, which have taken a share
     of slow noise with them. From each, blocks are picked through the filter and the filter is
     estimated again with those in the model; the likelier of the two ends, by BIC, is believed.
+
+    **Arguments:**
+
+    - `alike`: whether noise has one level in all of the data, which are windows of recordings.
     """
     flat = tuple(
         ARFilter(np.zeros(0), float(np.mean(np.concatenate(data.series(data.residual, j)) ** 2)))
@@ -38,14 +42,14 @@ def estimate_noise(data: Data, blocks: Blocks) -> Separated:
     plain = leftover(data, flat, ())
     white = noise_of(data, plain, data.base.shape[-1], highest=0)
     rich = columns_of(blocks, select(Whitened.of(data, white), blocks))
-    ends = [_settle(*levelled(data, plain, 0.0), blocks)]
+    ends = [_settle(*levelled(data, plain, 0.0, alike), blocks, alike)]
     if rich:
         start = leftover(data, white, rich)
-        ends.append(_settle(*levelled(data, start, len(rich)), blocks))
+        ends.append(_settle(*levelled(data, start, len(rich), alike), blocks, alike))
     return min(ends, key=lambda end: end.bic)
 
 
-def _settle(data: Data, noise: tuple[ARFilter, ...], blocks: Blocks) -> Separated:
+def _settle(data: Data, noise: tuple[ARFilter, ...], blocks: Blocks, alike: bool) -> Separated:
     """Picks signatures and estimates the filter in turn."""
     chosen: list[int] = []
     columns: list[int] = []
@@ -54,7 +58,7 @@ def _settle(data: Data, noise: tuple[ARFilter, ...], blocks: Blocks) -> Separate
         chosen = select(Whitened.of(data, noise), blocks)
         columns = columns_of(blocks, chosen)
         rest = leftover(data, noise, columns)
-        data, noise = levelled(data, rest, data.base.shape[-1] + len(columns))
+        data, noise = levelled(data, rest, data.base.shape[-1] + len(columns), alike)
         if chosen == before:
             break
     size = data.mask.sum(axis=1)
@@ -92,17 +96,23 @@ def noise_of(data: Data, rows: Rows, lost: float, highest: int = 30) -> tuple[AR
     return tuple(filters)
 
 
-def levelled(data: Data, rows: Rows, lost: float) -> tuple[Data, tuple[ARFilter, ...]]:
+def levelled(
+    data: Data, rows: Rows, lost: float, alike: bool = False
+) -> tuple[Data, tuple[ARFilter, ...]]:
     """The data with the level of noise of each recording, and the filters of all.
 
     An output has levels where its recordings differ by more than chance (BIC): a motion that is
     slow and one that is fast need not have the same noise, and to pool them would make p-values of
     what acts in the louder one too small.
 
-    **Arguments:** as for `noise_of`.
+    **Arguments:** as for `noise_of`, and
+
+    - `alike`: whether there is but one level.
     """
     data = dataclasses.replace(data, level=None)
     noise = noise_of(data, rows, lost)
+    if alike:
+        return data, noise
     white = data.white(rows, noise)
     count = data.mask.sum(axis=1)[:, None] - np.array([f.order for f in noise])
     power = np.sum(white**2, axis=1) / count
