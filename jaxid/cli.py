@@ -110,12 +110,20 @@ def load_robot(robot: str) -> Any:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.path.insert(0, str(Path(path).resolve().parent))
+    # Annotations that are strings are looked up in the module that they were written in.
+    sys.modules.setdefault(spec.name, module)
     try:
         spec.loader.exec_module(module)
     except Exception as error:
         raise ModelError(f"{path} fails when it is imported ({error!r}): mend it first") from error
     made = getattr(module, name, None)
-    made = made() if callable(made) and not isinstance(made, ClosedLoop) else made
+    try:
+        made = made() if callable(made) and not isinstance(made, ClosedLoop) else made
+    except Exception as error:
+        raise ModelError(
+            f"{name}() in {path} fails ({error!r}): give a function without arguments that "
+            "returns a ClosedLoop"
+        ) from error
     if not isinstance(made, ClosedLoop):
         raise ModelError(f"{path} has no ClosedLoop called {name!r}: name the one it defines")
     return made
@@ -252,6 +260,8 @@ def fit(
         }
         if method not in methods:
             raise ModelError(f"there is no method {method!r}: choose {', '.join(methods)}")
+        if window is not None and method not in ("oem", "pem"):
+            raise ModelError(f"--method {method} simulates nothing in windows: leave out --window")
         loop = _with_controller(load_robot(robot), controller)
         found = estimate.fit(loop, _read(files, column, unit), methods[method]())
         typer.echo(repr(found).partition("\n")[0] if quiet else repr(found))

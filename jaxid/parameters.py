@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from types import MappingProxyType
@@ -191,13 +192,14 @@ def write_values(model: Any, parameters: Sequence[Parameter], values: Vector) ->
 
 
 def set_by_name(model: Any, **values: float) -> Any:
-    """The model with the named parameters set.
+    """The model with the named parameters set: one that holds several whole, or as `name[1]`, ….
 
     **Raises:** `ModelError` for a name the model does not have.
     """
     if not values:
         return model
     known = {p.name: p for p in list_parameters(model)}
+    values = _whole(model, known, values)
     for name in values:
         if name not in known:
             raise ModelError(
@@ -211,6 +213,21 @@ def set_by_name(model: Any, **values: float) -> Any:
     chosen = [known[name] for name in values]
     flat = jnp.concatenate([jnp.ravel(as_float64(v)) for v in values.values()])
     return write_values(model, chosen, flat)
+
+
+def _whole(model: Any, known: dict[str, Parameter], values: dict[str, float]) -> dict[str, Any]:
+    """Values by parameter, those given as `name[1]` put into what the model holds."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        indexed = re.fullmatch(r"(.+)\[(\d+)\]", name)
+        whole, place = (indexed[1], int(indexed[2])) if indexed else (name, 0)
+        if whole in known and 1 <= place <= known[whole].size:
+            had = found.get(whole, np.asarray(known[whole].where(model), float))
+            found[whole] = np.ravel(had).copy()
+            found[whole][place - 1] = value
+        else:
+            found[name] = value
+    return found
 
 
 class Bounds(eqx.Module):

@@ -111,13 +111,27 @@ def _grid(recording: Recording, period: float | None) -> tuple[np.ndarray, np.nd
     """Grid times and which of them are ticks: the samples, and the controller's own instants."""
     time = recording.time
     if period is None:
-        return time, np.zeros(len(time), bool)
+        grid = _without_gaps(time, recording.period)
+        return grid, np.zeros(len(grid), bool)
     ticks = time[0] + period * np.arange(int((time[-1] - time[0]) / period + 1e-6) + 1)
     # Instants closer than a thousandth of a period are the same: clocks are written in decimals.
     near = time[np.clip(np.searchsorted(time, ticks - 1e-3 * period), 0, len(time) - 1)]
     ticks = np.where(np.abs(near - ticks) < 1e-3 * period, near, ticks)
     grid = np.union1d(time, ticks)
     return grid, np.isin(grid, ticks)
+
+
+def _without_gaps(
+    time: Float[np.ndarray, " samples"], period: float
+) -> Float[np.ndarray, " points"]:
+    """The samples, and evenly between them where they are further apart than usual."""
+    parts = np.maximum(np.round(np.diff(time) / period - 0.25), 1).astype(int)
+    if parts.max() == 1:
+        return time
+    first = np.repeat(time[:-1], parts)
+    step = np.repeat(np.diff(time) / parts, parts)
+    number = np.arange(len(first)) - np.repeat(np.cumsum(parts) - parts, parts)
+    return np.append(first + number * step, time[-1])
 
 
 def _drive(
@@ -483,7 +497,9 @@ def simulate(
     return by_recording(simulate_batch(loop, prepare(loop, recordings, noise)), recordings)
 
 
-def by_recording(together: Simulated, recordings: Recordings) -> tuple[Simulated, ...]:
+def by_recording(
+    together: Simulated, recordings: Recordings | Sequence[Recording]
+) -> tuple[Simulated, ...]:
     """The runs of a batch, `(recordings, samples, ...)`, one by one with their own samples."""
     return tuple(
         jax.tree.map(lambda leaf, k=k, r=r: leaf[k, : r.samples], together)
@@ -504,8 +520,8 @@ def simulate_batch(loop: ClosedLoop, batch: Batch) -> Simulated:
 def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     """The loop with the number of steps between samples settled, where the user left it open.
 
-    A step is at most 2.5 ms, and at most a quarter of the fastest time constant, met
-    with friction at its steepest, at standstill.
+    A step is at most 2.5 ms, and at most a quarter of the fastest time constant, met with friction
+    at its steepest, at standstill, or at speed, where a bristle's is shortest.
     """
     check_joints(loop, recordings[0])
     if loop.stepping.substeps is not None:
@@ -541,28 +557,46 @@ def with_rolled_stages(loop: ClosedLoop) -> ClosedLoop:
 
 
 def fastest_rate(loop: ClosedLoop, recordings: Recordings) -> float:
-    """Largest eigenvalue of the loop's equations at standstill along the recordings, 1/s."""
-    q = np.concatenate([r.q[:: max(1, r.samples // 8)] for r in recordings])
-    return float(_fastest(loop, jnp.asarray(q)))
+    """Largest eigenvalue of the loop's equations along the recordings, 1/s.
+
+    At standstill; and as fast as each recording gets over ten samples, where an eighth counts: a
+    bristle at speed follows at once, and steps must but be small enough not to run away.
+    """
+    still = np.concatenate([r.q[:: max(1, r.samples // 8)] for r in recordings])
+    q, v = [], []
+    for r in recordings:
+        span = min(10, r.samples - 1)
+        speed = (r.q[span:] - r.q[:-span]) / (r.time[span:] - r.time[:-span])[:, None]
+        fastest = np.abs(speed).argmax(axis=0)
+        q.append(r.q[fastest])
+        v.append(speed[fastest])
+    moving = _fastest(loop, np.concatenate(q), np.concatenate(v))
+    return max(_fastest(loop, still, np.zeros_like(still)), moving / 8)
 
 
 @eqx.filter_jit
-def _slopes(loop: ClosedLoop, q: Float[Array, "points joints"]) -> Float[Array, "points n n"]:
-    n = loop.joints
-    zeros = jnp.zeros(n)
+def _slopes(
+    loop: ClosedLoop, q: Float[Array, "points joints"], v: Float[Array, "points joints"]
+) -> Float[Array, "points n n"]:
+    zeros = jnp.zeros(loop.joints)
 
-    def rate(x, at):
-        reference = Reference(at, zeros, zeros, zeros)
+    def rate(x, at, speed):
+        reference = Reference(at, speed, zeros, zeros)
         state = unflatten(loop)(x)
         outside = Outside(zeros, zeros, Reading(zeros, zeros))
         now = instant(loop, jnp.zeros(()), state, reference, outside, jnp.asarray(NOBODY))
         return ravel_pytree(now.derivative)[0]
 
-    return jax.vmap(lambda at: jax.jacfwd(rate)(ravel_pytree(rest(loop, at, zeros))[0], at))(q)
+    def slope(at, speed):
+        return jax.jacfwd(rate)(ravel_pytree(rest(loop, at, speed))[0], at, speed)
+
+    return jax.vmap(slope)(q, v)
 
 
-def _fastest(loop: ClosedLoop, q: Float[Array, "points joints"]) -> float:
-    slopes = np.asarray(_slopes(loop, q))
+def _fastest(
+    loop: ClosedLoop, q: Float[np.ndarray, "points joints"], v: Float[np.ndarray, "points joints"]
+) -> float:
+    slopes = np.asarray(_slopes(loop, *jax.device_put((q, v))))
     usable = slopes[np.isfinite(slopes).all(axis=(1, 2))]
     return float(np.abs(np.linalg.eigvals(usable)).max()) if len(usable) else 0.0
 

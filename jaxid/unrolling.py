@@ -17,9 +17,9 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-# Arrays above this size are left whole: writing a spline's dozen knots out would only make
-# programs long.
-WHOLE = 9
+# Arrays above these sizes are left whole: writing a spline's dozen knots out would only make
+# programs long. Matrices and what has more axes are a few joints' own, and their derivatives.
+WHOLE, WHOLE_MATRIX = 9, 36
 
 ELEMENTWISE = frozenset(
     """
@@ -98,7 +98,7 @@ class _Value:
 
     @property
     def small(self) -> bool:
-        return math.prod(self.shape) <= WHOLE
+        return math.prod(self.shape) <= (WHOLE if len(self.shape) < 2 else WHOLE_MATRIX)
 
     @property
     def written_out(self) -> bool:
@@ -173,6 +173,13 @@ class _Writer:
             return self.product(p, *inputs)
         if name == "reduce_sum":
             return self.total(p, inputs[0])
+        if name == "cumsum":
+            return self.running(p, inputs[0])
+        if name == "iota":
+            shape = [1] * len(p["shape"])
+            shape[p["dimension"]] = -1
+            count = np.arange(p["shape"][p["dimension"]]).astype(p["dtype"])
+            return _objects(np.broadcast_to(count.reshape(shape), p["shape"]))
         if name in ("scatter", "scatter-add", "scatter-mul"):
             return self.scattered(name, p, *inputs)
         return None
@@ -218,19 +225,30 @@ class _Writer:
 
     def product(self, p, left: _Value, right: _Value):
         (contract_left, contract_right), (batch_left, batch_right) = p["dimension_numbers"]
-        if batch_left or batch_right or left.dtype != right.dtype:
+        if left.dtype != right.dtype:
             return None
-        a = np.moveaxis(left.scalars(), contract_left, range(len(contract_left)))
-        b = np.moveaxis(right.scalars(), contract_right, range(len(contract_right)))
-        shared, depth = a.shape[: len(contract_left)], math.prod(a.shape[: len(contract_left)])
-        rows, columns = a.shape[len(shared) :], b.shape[len(shared) :]
-        a, b = a.reshape(depth, -1), b.reshape(depth, -1)
-        out = np.empty((a.shape[1], b.shape[1]), object)
-        for i, j in np.ndindex(out.shape):
-            out[i, j] = np.zeros((), left.dtype)[()]
+        batch, shared = len(batch_left), len(contract_left)
+        first = (*batch_left, *contract_left), (*batch_right, *contract_right)
+        a = np.moveaxis(left.scalars(), first[0], range(batch + shared))
+        b = np.moveaxis(right.scalars(), first[1], range(batch + shared))
+        several, depth = a.shape[:batch], math.prod(a.shape[batch : batch + shared])
+        rows, columns = a.shape[batch + shared :], b.shape[batch + shared :]
+        a = a.reshape(math.prod(several), depth, math.prod(rows))
+        b = b.reshape(math.prod(several), depth, math.prod(columns))
+        out = np.empty((a.shape[0], a.shape[2], b.shape[2]), object)
+        for n, i, j in np.ndindex(out.shape):
+            out[n, i, j] = np.zeros((), left.dtype)[()]
             for k in range(depth):
-                out[i, j] = self.plus(out[i, j], self.times(a[k, i], b[k, j]))
-        return out.reshape(rows + columns)
+                out[n, i, j] = self.plus(out[n, i, j], self.times(a[n, k, i], b[n, k, j]))
+        return out.reshape(several + rows + columns)
+
+    def running(self, p, value: _Value):
+        array = np.moveaxis(value.scalars(), p["axis"], 0)
+        array = array[::-1] if p["reverse"] else array
+        out = np.empty(array.shape, object)
+        for at in np.ndindex(array.shape):
+            out[at] = self.plus(out[at[0] - 1, *at[1:]], array[at]) if at[0] else array[at]
+        return np.moveaxis(out[::-1] if p["reverse"] else out, 0, p["axis"])
 
     def total(self, p, value: _Value):
         array = value.scalars()
@@ -260,6 +278,14 @@ class _Writer:
             update = self.times(out[place], update)
         out[place] = update
         return out
+
+
+def _objects(array: np.ndarray) -> np.ndarray:
+    """The same numbers as scalars of NumPy, known when the program is made."""
+    out = np.empty(array.shape, object)
+    for at in np.ndindex(array.shape):
+        out[at] = array[at]
+    return out
 
 
 def _broadcast(p, x):
@@ -295,6 +321,7 @@ MOVES: dict[str, Callable[..., Any]] = {
     "split": _split,
     "concatenate": lambda p, *xs: np.concatenate(xs, axis=p["dimension"]),
     "stack": lambda p, *xs: np.stack(xs, axis=p["axis"]),
+    "unstack": lambda p, x: list(np.moveaxis(x, p["axis"], 0)),
 }
 # What is worth knowing already when a program is written: indices, and zeros.
 ARITHMETIC: dict[str, Callable[..., Any]] = {

@@ -5,13 +5,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
 import jaxid
 import jaxid.discovery
-from jaxid.cli import app, load_robot
+from jaxid.cli import _with_fitted, app, load_robot
 from jaxid.errors import ModelError
 
 DEMO = Path(jaxid.__file__).parent / "demo" / "clean"
@@ -156,6 +157,36 @@ def test_what_is_wrong_with_ones_own_robot_is_said(tmp_path):
     broken.write_text("import nothing_of_that_name\n")
     with pytest.raises(ModelError, match="fails when it is imported"):
         load_robot(f"{broken}:loop")
+    file.write_text(OWN_ROBOT + "\n\ndef asks(more):\n    return loop\n")
+    with pytest.raises(ModelError, match=r"asks\(\) in .* give a function without arguments"):
+        load_robot(f"{file}:asks")
+
+
+def test_annotations_of_ones_own_robot_may_be_strings(tmp_path):
+    file = tmp_path / "robot_of_strings.py"
+    own = "\n\nclass Mine(jaxid.effects.AbstractEffect):\n    joint: int = 1\n"
+    file.write_text("from __future__ import annotations\n" + OWN_ROBOT + own)
+    assert "MX2" in load_robot(f"{file}:loop").names
+
+
+def test_windows_are_refused_where_nothing_is_simulated():
+    result = run("fit", FIT_1, "--method", "idim", "--window", "1")
+    assert result.exit_code == 2
+    assert "leave out --window" in result.stderr
+
+
+def test_vectors_come_back_from_a_file_of_fitted_parameters(tmp_path):
+    own = tmp_path / "curved.py"
+    curve = 'jaxid.Curve(joint=1, coordinate="q", of=1, low=-1.0, high=1.0)'
+    own.write_text(f"import jaxid\nloop = jaxid.scara().add({curve})\n")
+    loop = load_robot(f"{own}:loop")
+    several = [name for name in loop.names if name.endswith("[2]")]
+    assert several
+    path = tmp_path / "fit.json"
+    values = {name: 0.01 * k for k, name in enumerate(loop.names, start=1)}
+    found = {"parameters": {name: {"value": value} for name, value in values.items()}}
+    path.write_text(json.dumps(found))
+    assert np.allclose(_with_fitted(loop, path).theta, list(values.values()))
 
 
 def test_demo_tells_both_stories_on_files_that_are_shipped(monkeypatch):

@@ -251,7 +251,7 @@ def test_rival_with_less_takes_the_place_of_an_early_effect(offset_case, offset_
     steps = with_chain(search, start, spring, drag)
     fits = steps[1].fit, with_chain(search, start, TorqueOffset(joint=2))[1].fit
     contenders = tuple(
-        Contender(name, 2, fitted, search.criterion(fitted, start.diagnosis.noise))
+        Contender(name, 2, fitted, search.criterion(fitted, start.diagnosis))
         for name, fitted in zip(("spring", "torque_offset"), fits, strict=True)
     )
     steps[1] = dataclasses.replace(steps[1], contenders=contenders)
@@ -363,6 +363,40 @@ def test_next_experiment_keeps_its_limits_and_separates(offset_story):
     assert np.all(proposed.recording.q_ref <= limits.high + 1e-9)
     assert np.all(np.abs(proposed.recording.tau) <= 1.05 * limits.torque)
     assert proposed.then > 0
+    torque = dataclasses.replace(diagnosis.fit.loop, controller=jaxid.control.OpenLoop())
+    driven = dataclasses.replace(diagnosis, fit=dataclasses.replace(diagnosis.fit, loop=torque))
+    with pytest.raises(jaxid.errors.FitError, match="it follows no reference"):
+        driven.next_experiment()
+
+
+def test_limits_without_a_reference_are_not_those_of_the_noise():
+    time = np.arange(0, 20, 1e-3)
+    q = np.sin(time)[:, None]
+    noise = 2e-4 * np.random.default_rng(0).standard_normal(q.shape)
+    reached = jaxid.Limits.of([jaxid.Recording(time, q + noise, q)])
+    assert 0.9 < reached.acceleration[0] < 1.5
+
+
+def test_recordings_of_different_rates_share_no_noise_filter():
+    def at(rate):
+        time = np.arange(0, 4, 1 / rate)
+        q = np.stack([np.sin(2 * time), np.sin(3 * time)], axis=1)
+        return jaxid.Recording(time, q, q, q_ref=q, name=f"at {rate}")
+
+    both = [at(100), at(200)]
+    for method in (jaxid.SeparablePEM(), jaxid.JointPEM()):
+        with pytest.raises(jaxid.errors.RecordingError, match="a noise filter is of one rate"):
+            jaxid.fit(jaxid.scara(), both, method)
+    with pytest.raises(jaxid.errors.RecordingError, match="200 samples a second"):
+        jaxid.discover(jaxid.scara(), both[0], both[1], progress=False)
+    with pytest.raises(jaxid.errors.RecordingError, match="200 samples a second"):
+        jaxid.diagnose(jaxid.compare(jaxid.scara(), both), progress=False)
+
+
+def test_a_search_that_was_told_to_stop_says_so(offset_story):
+    story, _ = offset_story
+    assert "nothing is left" in story.sentence
+    assert "told to stop" in dataclasses.replace(story, unfinished=True).sentence
 
 
 def test_clean_recordings_are_adequate():

@@ -516,3 +516,32 @@ def test_more_steps_where_the_loop_is_quicker(lengths):
     assert min(64, 0.01 * lowest / 0.25) <= substeps <= min(64, 2 * 0.01 * lowest / 0.25 + 1)
     chosen = dataclasses.replace(slow, stepping=jaxid.Stepping(substeps=3))
     assert with_substeps(chosen, recordings).stepping.substeps == 3
+
+
+def test_long_intervals_are_filled_up():
+    time = np.concatenate([np.arange(0, 1, 0.01), np.arange(1.5, 3.0, 0.01)])
+
+    def at(time):
+        q = np.stack([0.6 * np.sin(2 * time), 0.4 * np.sin(3 * time)], axis=1)
+        return jaxid.Recording.from_arrays(time, q, np.cos(q), q_ref=q, gaps="allow")
+
+    loop = jaxid.scara().with_values(**SCARA_VALUES)
+    whole, gapped = at(np.arange(0, 3.0, 0.01)), at(time)
+    expected, found = jaxid.simulate(loop, whole)[0], jaxid.simulate(loop, gapped)[0]
+    assert len(found.time) == gapped.samples
+    kept = np.searchsorted(whole.time, gapped.time - 1e-6)
+    # A spline of the reference over half a second is not the reference itself.
+    after = np.isin(gapped.time, gapped.time[gapped.time > 1.8])
+    assert relative(found.tau[after], expected.tau[kept][after]).max() < 0.02
+    fine = jaxid.simulate(dataclasses.replace(loop, stepping=jaxid.Stepping(substeps=32)), gapped)
+    assert relative(found.tau, fine[0].tau).max() < 1e-3
+
+
+def test_a_bristle_at_speed_asks_for_smaller_steps(lengths):
+    recordings = jaxid.Recordings.of(lengths)
+    stiff = jaxid.scara().add(jaxid.effects.Hysteresis(joint=2, level=0.1, slide=6e-4))
+    speed = max(np.abs(np.diff(r.q[:, 1]) / np.diff(r.time)).max() for r in recordings)
+    substeps = with_substeps(stiff, recordings).stepping.substeps
+    # Runge and Kutta's fourth order runs away at 2.8 over the rate, which is speed over slide.
+    assert 0.01 * speed / 6e-4 / substeps < 2.8
+    assert all(np.isfinite(run.tau).all() for run in jaxid.simulate(stiff, recordings))

@@ -241,6 +241,9 @@ def test_suspicious_units_warn_and_named_units_do_not() -> None:
     slow = signals() | {"time": 1e3 * signals()["time"]}
     with pytest.warns(JaxidWarning, match="looks like milliseconds"):
         Recording.from_arrays(**slow)
+    late = signals() | {"time": 1.7e9 + signals()["time"]}
+    with pytest.warns(JaxidWarning, match="time begins at 1700000000 s"):
+        Recording.from_arrays(**late)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Recording.from_arrays(**given, units={"q": "rad"})

@@ -39,7 +39,25 @@ def _empty(x, y):
     return jnp.concatenate([x, jnp.zeros(0), y]), jnp.zeros((2, 2)) @ x + y
 
 
-CASES = [_gather, _shapes, _choices, _decomposed, _large, _empty]
+def _chain(x, y):
+    """What arms of several joints are made of: sums along a chain, products link by link."""
+    each = jnp.cumsum(jnp.stack([jnp.cos(jnp.cumsum(x)), y * x, x]), axis=0)
+    turned = jnp.einsum("kx,kxi,kxj->ij", each, each[..., None] * x, each[..., None] * y)
+    one, other, _ = each
+    return turned, one * other, jnp.cumsum(each, axis=1, dtype=float)[::-1], jnp.cumsum(y[::-1])
+
+
+def _derived(x, y):
+    """Derivatives of a matrix by positions: more numbers than a matrix, and written out too."""
+
+    def matrix(q):
+        return jnp.outer(jnp.cos(q), jnp.sin(jnp.cumsum(q))) + jnp.eye(3)
+
+    three = jnp.concatenate([x, y[:1]])
+    return jax.jacfwd(matrix)(three) @ three, jax.grad(lambda q: matrix(q).sum())(three)
+
+
+CASES = [_gather, _shapes, _choices, _decomposed, _large, _empty, _chain, _derived]
 
 
 @pytest.mark.parametrize("fun", CASES, ids=lambda f: f.__name__.strip("_"))

@@ -80,7 +80,7 @@ class AbstractArm(eqx.Module):
         return (False,) * self.joints
 
     def link_lengths(self) -> tuple[float, ...]:
-        """Lengths of the links before the last, m; what a payload's torque needs."""
+        """Lengths of the links before the last, m; without them no payload is looked for."""
         return ()
 
     def first_moments(self) -> tuple[tuple[float, float] | None, ...]:
@@ -104,7 +104,11 @@ class AbstractArm(eqx.Module):
         turn = np.linspace(-np.pi, np.pi, 25)
         if self.joints == 1:
             return turn[:, None]
-        return np.stack([np.zeros((25, self.joints - 1)).T[0], turn], axis=1)
+        if self.joints == 2:
+            return np.stack([np.zeros(25), turn], axis=1)
+        # A lattice over many joints would be too many; how the first stands does not matter.
+        drawn = np.random.default_rng(0).uniform(-np.pi, np.pi, (25 * self.joints, self.joints))
+        return drawn * (np.arange(self.joints) > 0)
 
     def smallest_inertia(self) -> Float[Array, ""]:
         """Smallest eigenvalue of the mass matrix over the workspace; above zero when physical."""

@@ -30,7 +30,6 @@ from ..simulate import (
     by_recording,
     compared,
     prepare,
-    simulate,
     simulate_batch,
     with_substeps,
 )
@@ -207,7 +206,8 @@ def compare(
         if not np.isfinite(run.tau).all() or not np.isfinite(run.q).all():
             raise FitError(
                 f"the loop {loop.name} diverges when it is simulated along {recording.name}: "
-                "fit it first, or start from other values"
+                "fit it first, start from other values, or take smaller steps "
+                "(jaxid.Stepping(substeps=...))"
             )
     return Comparison(loop, recordings, runs, _errors(loop, recordings, runs))
 
@@ -221,8 +221,10 @@ def _simulate_in_windows(
         return by_recording(simulate_batch(loop, batch), recordings)
     runs = []
     for recording in recordings:
+        # Windows keep their recording's name, which effects of named recordings go by.
         pieces = pieces_of(Recordings.of(recording), window)
-        parts = simulate(loop, pieces)
+        stepped = with_substeps(loop, Recordings.of(recording))
+        parts = by_recording(simulate_batch(stepped, prepare(stepped, pieces)), pieces)
         cut = [(0 if k == 0 else 1) for k in range(len(parts))]
         whole = {
             name: np.concatenate(

@@ -364,8 +364,10 @@ def diagnose(
       `(*jaxid.catalogue, Mine)`.
     - `significance`: corrected p-value below which something counts as missing.
 
-    **Raises:** `FitError` where the fitted loop cannot be simulated.
+    **Raises:** `FitError` where the fitted loop cannot be simulated; `RecordingError` where
+    recordings were sampled at different rates.
     """
+    fit.recordings.common_period()
     if fit.error_percent.to_numpy().max() < 1e-8:
         raise FitError(
             f"{fit.loop.name} leaves nothing of these recordings but rounding: they were simulated "
@@ -442,7 +444,7 @@ def _tones(
     residual: np.ndarray, mask: np.ndarray, recordings: Recordings, most: int = 4
 ) -> tuple[list[list[float]], float]:
     """Frequencies that stand out of each joint's spectrum, and how many they were picked from."""
-    period = float(np.median([r.period for r in recordings]))
+    period = recordings.common_period()
     n = residual.shape[1]
     f = np.fft.rfftfreq(4 * n, period)
     usable = (f > 2 / (n * period)) & (f < 0.4 / period)
@@ -576,7 +578,9 @@ def _floor(
         return fit.error_percent.to_numpy() * level
     error = np.sqrt(np.sum(rest**2, axis=1))
     size = np.sqrt(np.sum(data.residual**2, axis=1))
-    return fit.error_percent.to_numpy() * error / size / np.sqrt(max(freedom, 0.1))
+    # What is least once whitened may be more than what the model leaves as it is.
+    share = np.minimum(error / size, 1) / np.sqrt(max(freedom, 0.1))
+    return fit.error_percent.to_numpy() * share
 
 
 def effect_parameters(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[int, str, str]]:

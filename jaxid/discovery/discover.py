@@ -23,7 +23,6 @@ from ..noise import ARFilter, fit_ar
 from ..parameters import Bounds, list_parameters, read_values, write_values
 from ..progress import working
 from ..recording import Recording, Recordings
-from ..simulate import compared
 from .compare import compare
 from .diagnose import Diagnosis, Verdict, diagnose
 from .score import whitened
@@ -59,11 +58,13 @@ def discover(
       goes on; it is made where it is not there.
 
     **Raises:** `FitError`, `ModelError`, `RecordingError` where model and recordings do not fit;
-    `SaveError` where the folder holds steps of another call.
+    also where they were sampled at different rates; `SaveError` where the folder holds steps of
+    another call.
     """
     started = time.perf_counter()
     recordings = Recordings.of(recordings)
     held_out = None if validate is None else Recordings.of(validate)
+    Recordings.of([*recordings, *(held_out or ())]).common_period()
     search = _Search(
         recordings, held_out, tuple(catalogue), method or OEM(), significance, progress
     )
@@ -82,32 +83,36 @@ def discover(
                 steps.extend(more)
             return verdict, steps
 
-        verdict, steps = follow([campaign.piece("start", lambda: search.begin(loop, say))], "turn")
+        start = campaign.piece("start", lambda: search.begin(loop, say))
+        # A recording along which the first fit runs away is left out of all that follows.
+        search = dataclasses.replace(search, recordings=start.fit.recordings)
+        verdict, steps = follow([start], "turn")
         if verdict == "outside_catalogue" and len(steps) > 1:
             parted = campaign.piece("afresh", lambda: search.afresh(steps, say))
             if parted is not None:
                 verdict, steps = follow([steps[0], parted], "afresh")
+        unfinished = len(steps) > most and bool(_entries(steps, search.matters(steps)))
         steps, removed = search.prune(steps, say)
-        notes = _notes(steps, most)
+        notes = _notes(steps)
+        if unfinished:
+            notes = (f"stopped after {most} effects, as told: raise most to go on", *notes)
         if search.is_series(steps, say):
             note, steps, removed = _series_note(steps), steps[:1], ()
-            verdict, notes = "outside_catalogue", (*_notes(steps, most), note)
+            verdict, notes, unfinished = "outside_catalogue", (*_notes(steps), note), False
     if verdict != "outside_catalogue" and steps[-1].fit.status is Status.misfit:
         raise FitError(
             f"neither {loop.name} nor the catalogue explains anything of these recordings: "
             f"{steps[-1].fit.notes[-1]}"
         )
-    return Discovery(verdict, tuple(steps), removed, notes, time.perf_counter() - started)
+    seconds = time.perf_counter() - started
+    return Discovery(verdict, tuple(steps), removed, notes, seconds, unfinished)
 
 
-def _notes(steps: Sequence[Step], most: int) -> tuple[str, ...]:
-    notes = []
-    if len(steps) > most:
-        notes.append(f"stopped after {most} effects, although something may be left: raise most")
+def _notes(steps: Sequence[Step]) -> tuple[str, ...]:
     bad = [s.label for s in steps if not s.fit.succeeded]
-    if bad:
-        notes.append(f"the fit of {', '.join(bad)} did not converge: read its values with care")
-    return tuple(notes)
+    if not bad:
+        return ()
+    return (f"the fit of {', '.join(bad)} did not converge: read its values with care",)
 
 
 def _fitted_criterion(found: Fit, diagnosis: Diagnosis) -> float:
@@ -156,7 +161,8 @@ class _Search(eqx.Module):
         # With the noise known, once more: where it is strongly coloured, plain output error leaves
         # the parameters so far off that what follows would have to explain that. A filter fitted to
         # the residual itself would take what is missing for noise, and the model further off.
-        again = fit(first.loop, self.recordings, self.whitened_method(step.diagnosis))
+        again = fit(first.loop, first.recordings, self.whitened_method(step.diagnosis))
+        again = dataclasses.replace(again, notes=(*first.notes, *again.notes))
         return self.step("start", again) if again.succeeded else step
 
     def step(self, label: str, found: Fit, **extra: Any) -> Step:
@@ -420,7 +426,7 @@ class _Search(eqx.Module):
             return 0.0
         try:
             with np.errstate(over="ignore", invalid="ignore"):
-                error = _whitened_error(_held_residuals(found, self.held_out), diagnosis.noise)
+                error = _whitened_error(compare(found, self.held_out).residuals, diagnosis.noise)
         except (ArithmeticError, ValueError, RuntimeError):
             return np.inf
         return error if np.isfinite(error) else np.inf
@@ -666,11 +672,6 @@ def _alike(
     ]
     near += [v.key for v in diagnosis.alike(chosen) if v.key not in refitted]
     return tuple(near)
-
-
-def _held_residuals(found: Fit, held_out: Recordings) -> list[Float[np.ndarray, "_ joints"]]:
-    comparison = compare(found, held_out)
-    return compared(found.loop, held_out, list(comparison.residuals))
 
 
 def _whitened_error(

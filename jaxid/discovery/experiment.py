@@ -10,6 +10,7 @@ import plotly.graph_objects as go
 from jaxtyping import Float
 
 from .. import figures
+from ..control import OpenLoop
 from ..effects import AbstractTransmission
 from ..errors import FitError
 from ..excitation import Limits
@@ -29,20 +30,22 @@ class Experiment(AbstractShown):
     - `recording`: its `time` and `q_ref`; `q` and `tau` are what the model expects.
     - `now`, `then`: whitened squared error by which the effects differ, on the recordings at hand
       and on the proposed one; ten is decisive.
+    - `units`: of torque and of position, one a joint each.
     """
 
     recording: Recording
     effects: tuple[str, ...] = eqx.field(static=True)
     now: float
     then: float
+    units: tuple[tuple[str, ...], tuple[str, ...]] = eqx.field(static=True)
 
     def plot(self) -> go.Figure:
         """The reference in time."""
         r = self.recording
         assert r.q_ref is not None
         panels = [
-            [figures.Trace(f"joint {j}", column, "rad", "reference")]
-            for j, column in enumerate(r.q_ref.T, start=1)
+            [figures.Trace(f"joint {j}", column, unit, "reference")]
+            for j, (column, unit) in enumerate(zip(r.q_ref.T, self.units[1], strict=True), start=1)
         ]
         return figures.signals(r.time, panels)
 
@@ -52,15 +55,15 @@ class Experiment(AbstractShown):
         speed = np.abs(np.gradient(r.q_ref, r.time, axis=0))
         rows = [
             {
-                "from, rad": r.q_ref[:, j].min(),
-                "to, rad": r.q_ref[:, j].max(),
-                "speed up to, rad/s": speed[:, j].max(),
-                "torque up to, N·m": np.abs(r.tau[:, j]).max(),
+                "from": f"{r.q_ref[:, j].min():.3g} {position}",
+                "to": f"{r.q_ref[:, j].max():.3g} {position}",
+                "speed up to": f"{speed[:, j].max():.3g} {position}/s",
+                "torque up to": f"{np.abs(r.tau[:, j]).max():.3g} {torque}",
             }
-            for j in range(r.joints)
+            for j, (torque, position) in enumerate(zip(*self.units, strict=True))
         ]
         table = pd.DataFrame(rows, index=[f"joint {j}" for j in range(1, r.joints + 1)])
-        return f"<p>{html.escape(repr(self))}</p>{table.to_html(float_format='%.3g')}"
+        return f"<p>{html.escape(repr(self))}</p>{table.to_html()}"
 
     def __repr__(self) -> str:
         return (
@@ -90,8 +93,14 @@ def next_experiment(
     - `limits`: by default what the recordings at hand have reached.
     - `duration`: s. `tries`: how many references are drawn.
 
-    **Raises:** `FitError` where nothing can be compared, or no reference keeps within the limits.
+    **Raises:** `FitError` where nothing can be compared, no reference keeps within the limits, or
+    the loop follows none.
     """
+    if isinstance(diagnosis.fit.loop.controller, OpenLoop):
+        raise FitError(
+            "recorded torque drives this loop, so it follows no reference that could be proposed: "
+            "give the loop its controller"
+        )
     chosen = list(effects) if effects is not None else _group(diagnosis)
     # A transmission's signature is a simulation of its own, too slow to repeat for each reference.
     chosen = [v for v in chosen if not isinstance(v.hypothesis.effect, AbstractTransmission)]
@@ -113,7 +122,7 @@ def next_experiment(
     names = tuple(v.hypothesis.name for v in chosen)
     columns = [list(v.hypothesis.columns) for v in chosen]
     now = _apart(diagnosis.gram, columns, [diagnosis.gram.amplitude(c)[0] for c in columns])
-    return Experiment(runs[best], names, now, float(scores[best]))
+    return Experiment(runs[best], names, now, float(scores[best]), loop.arm.units())
 
 
 def _group(diagnosis: Diagnosis) -> list[Verdict]:

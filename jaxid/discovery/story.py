@@ -57,6 +57,7 @@ class Discovery(AbstractShown):
     - `verdict`: `"adequate"`, `"explained"` or `"outside_catalogue"`.
     - `steps`: the first is the starting model.
     - `removed`: effects that were added and later found not to be needed.
+    - `unfinished`: whether it stopped, as told, while an effect of the catalogue was still to add.
     """
 
     verdict: Outcome = eqx.field(static=True)
@@ -64,6 +65,7 @@ class Discovery(AbstractShown):
     removed: tuple[tuple[str, int | None], ...] = ()
     notes: tuple[str, ...] = eqx.field(static=True, default=())
     seconds: float = eqx.field(static=True, default=0.0)
+    unfinished: bool = eqx.field(static=True, default=False)
 
     @property
     def fit(self) -> Fit:
@@ -88,6 +90,11 @@ class Discovery(AbstractShown):
             return (
                 f"The model of {self.loop.name} describes these recordings down to their noise: "
                 "nothing is missing."
+            )
+        if self.unfinished:
+            return (
+                f"The model lacked {' and '.join(added)}, and lacks more: the search was told to "
+                "stop there."
             )
         if self.verdict == "explained":
             return f"The model lacked {' and '.join(added)}; with that, nothing is left to explain."

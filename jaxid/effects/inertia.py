@@ -49,10 +49,14 @@ class Payload(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Payload"]:
-        """Each recording in turn: on all of them it cannot be told from the link's own mass."""
-        if len(scene.recordings) < 2:
+        """Each recording in turn: on all of them it cannot be told from the link's own mass.
+
+        Of arms that turn, only with known lengths of links; of arms that turn and slide, none.
+        """
+        slides = all(scene.slides)
+        known = slides or len(scene.lengths) == len(scene.slides) - 1
+        if len(scene.recordings) < 2 or not known or any(scene.slides) != slides:
             return []
-        slides = any(scene.slides)
         reaches = (0.0,) if slides else (0.1, 0.2, 0.35, 0.5)
         return [
             cls(recordings=(name,), reach=reach, lengths=scene.lengths, g=scene.g, slides=slides)

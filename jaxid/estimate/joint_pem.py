@@ -67,6 +67,7 @@ class JointPEM(AbstractMethod):
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
         """Estimates the loop's free parameters; called by `jaxid.fit`."""
         started = time.perf_counter()
+        recordings.common_period()
         with working(f"JointPEM of {loop.name}", self.oem.progress) as say:
             loop = with_substeps(start_values(loop, recordings, self.oem.start, say), recordings)
             orders, noise, first = self._orders(loop, recordings, say)

@@ -84,6 +84,7 @@ class SeparablePEM(AbstractMethod):
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
         """Estimates the loop's free parameters; called by `jaxid.fit`."""
         started = time.perf_counter()
+        recordings.common_period()
         with working(f"SeparablePEM of {loop.name}", self.oem.progress) as say:
             loop = with_substeps(start_values(loop, recordings, self.oem.start, say), recordings)
             deadline = started + self.oem.max_seconds

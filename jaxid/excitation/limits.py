@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from ..errors import LimitsError
 from ..recording import Recording
+from ..smoothing import even_times, signal_cutoff, smooth_motion
 
 
 def _vector(value: object) -> Float[np.ndarray, " joints"]:
@@ -55,13 +56,19 @@ class Limits(eqx.Module):
 
     @classmethod
     def of(cls, recordings: Iterable[Recording]) -> "Limits":
-        """What recordings have reached: positions and torques measured, rates as asked for."""
+        """What recordings have reached: positions and torques measured, rates as asked for.
+
+        Where nothing was asked for, rates are those of the measured positions, low-passed.
+        """
         rows = list(recordings)
         speed, acceleration = [], []
         for r in rows:
-            v = np.gradient(r.q if r.q_ref is None else r.q_ref, r.time, axis=0)
+            time, q = r.time, r.q_ref
+            if q is None:
+                time, q = even_times(r), smooth_motion(r, signal_cutoff(r))
+            v = np.gradient(q, time, axis=0)
             speed.append(np.abs(v).max(axis=0))
-            acceleration.append(np.abs(np.gradient(v, r.time, axis=0)).max(axis=0))
+            acceleration.append(np.abs(np.gradient(v, time, axis=0)).max(axis=0))
         return cls(
             np.min([r.q.min(axis=0) for r in rows], axis=0),
             np.max([r.q.max(axis=0) for r in rows], axis=0),

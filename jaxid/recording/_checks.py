@@ -251,6 +251,15 @@ def _plausible(
             JaxidWarning,
             stacklevel=5,
         )
+    first, last = signals["time"][0], signals["time"][-1]
+    if abs(first) > 100 * (last - first):
+        warnings.warn(
+            f"{source}: time begins at {first:.10g} s, long before or after the recording: what "
+            "depends on time (friction that fades as a joint warms) counts from zero, so subtract "
+            "when the motion began.",
+            JaxidWarning,
+            stacklevel=5,
+        )
     if "time" not in units and np.median(np.diff(signals["time"])) >= 1:
         warnings.warn(
             f"{source}: samples are {np.median(np.diff(signals['time'])):.4g} s apart, which looks "

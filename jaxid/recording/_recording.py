@@ -222,6 +222,22 @@ class Recordings(eqx.Module):
         """What the recordings are called, each differently."""
         return tuple(recording.name for recording in self.recordings)
 
+    def common_period(self) -> float:
+        """The sample period, s, of what is to share one noise filter.
+
+        **Raises:** `RecordingError` where periods differ by more than a hundredth.
+        """
+        first = self.recordings[0]
+        for other in self.recordings:
+            if abs(other.period / first.period - 1) > 0.01:
+                raise problem(
+                    other.name,
+                    f"it has {other.rate:.4g} samples a second where {first.name} has "
+                    f"{first.rate:.4g}, and a noise filter is of one rate",
+                    "resample one of them, or use them apart",
+                )
+        return first.period
+
     def __iter__(self) -> Iterator[Recording]:
         return iter(self.recordings)
 
