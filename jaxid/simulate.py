@@ -513,7 +513,7 @@ def simulate_batch(loop: ClosedLoop, batch: Batch) -> Simulated:
     if loop.stepping.control is None:
         # One program for any number of steps: refining them need not compile again.
         substeps = jnp.asarray(loop.stepping.substeps or 1)
-        loop = set_substeps(loop, None)
+        loop = set_substeps(loop, None, settled=False)
     return jax.device_get(_simulate(loop, batch, substeps))
 
 
@@ -521,25 +521,39 @@ def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     """The loop with the number of steps between samples settled, where the user left it open.
 
     A step is at most 2.5 ms, and at most a quarter of the fastest time constant, met with friction
-    at its steepest, at standstill, or at speed, where a bristle's is shortest.
+    at its steepest, at standstill; and no step is so long that a bristle at speed runs away. A
+    number settled before grows where an effect with states of its own, added since, would.
     """
     check_joints(loop, recordings[0])
-    if loop.stepping.substeps is not None:
+    before, settled = loop.stepping.substeps, loop.stepping.settled
+    if before is not None and not (settled and _has_states(loop)):
         return loop
     period = loop.controller.period
     longest = max(r.period for r in recordings)
     interval = longest if period is None else min(longest, period)
-    rate = fastest_rate(loop, recordings)
-    # The torque of a stiff made-up law is wrong by about (pace · step)⁴ / 20.
-    pace = 7 * loop.controller.pace
-    substeps = int(np.ceil(interval * max(1 / 2.5e-3, rate / 0.25, pace) - 1e-9))
-    return set_substeps(loop, int(np.clip(substeps, 1, 64)))
+    still, moving = _rates(loop, recordings)
+    if before is None:
+        # The torque of a stiff made-up law is wrong by about (pace · step)⁴ / 20.
+        pace = 7 * loop.controller.pace
+        rate = max(1 / 2.5e-3, still / 0.25, moving / 2, pace)
+    else:
+        rate = max(before / interval, still / 2, moving / 2)
+    return set_substeps(loop, int(np.clip(np.ceil(interval * rate - 1e-9), 1, 64)), settled=True)
 
 
-def set_substeps(loop: ClosedLoop, substeps: int | None) -> ClosedLoop:
-    """The loop with that many steps between two grid points."""
-    stepping = dataclasses.replace(loop.stepping, substeps=substeps)
+def set_substeps(loop: ClosedLoop, substeps: int | None, settled: bool = False) -> ClosedLoop:
+    """The loop with that many steps between two grid points.
+
+    **Arguments:**
+
+    - `settled`: whether it is jaxid that has chosen them.
+    """
+    stepping = dataclasses.replace(loop.stepping, substeps=substeps, settled=settled)
     return dataclasses.replace(loop, stepping=stepping)
+
+
+def _has_states(loop: ClosedLoop) -> bool:
+    return any(effect.initial_state().size for effect in loop.effects)
 
 
 def with_rolled_stages(loop: ClosedLoop) -> ClosedLoop:
@@ -557,11 +571,12 @@ def with_rolled_stages(loop: ClosedLoop) -> ClosedLoop:
 
 
 def fastest_rate(loop: ClosedLoop, recordings: Recordings) -> float:
-    """Largest eigenvalue of the loop's equations along the recordings, 1/s.
+    """Largest eigenvalue of the loop's equations at standstill along the recordings, 1/s."""
+    return _rates(loop, recordings)[0]
 
-    At standstill; and as fast as each recording gets over ten samples, where an eighth counts: a
-    bristle at speed follows at once, and steps must but be small enough not to run away.
-    """
+
+def _rates(loop: ClosedLoop, recordings: Recordings) -> tuple[float, float]:
+    """Largest eigenvalues at standstill, and as fast as recordings get over ten samples, 1/s."""
     still = np.concatenate([r.q[:: max(1, r.samples // 8)] for r in recordings])
     q, v = [], []
     for r in recordings:
@@ -570,8 +585,9 @@ def fastest_rate(loop: ClosedLoop, recordings: Recordings) -> float:
         fastest = np.abs(speed).argmax(axis=0)
         q.append(r.q[fastest])
         v.append(speed[fastest])
-    moving = _fastest(loop, np.concatenate(q), np.concatenate(v))
-    return max(_fastest(loop, still, np.zeros_like(still)), moving / 8)
+    speed = np.concatenate([np.zeros_like(still), *v])
+    slopes = np.asarray(_slopes(loop, *jax.device_put((np.concatenate([still, *q]), speed))))
+    return _largest(slopes[: len(still)]), _largest(slopes[len(still) :])
 
 
 @eqx.filter_jit
@@ -593,10 +609,8 @@ def _slopes(
     return jax.vmap(slope)(q, v)
 
 
-def _fastest(
-    loop: ClosedLoop, q: Float[np.ndarray, "points joints"], v: Float[np.ndarray, "points joints"]
-) -> float:
-    slopes = np.asarray(_slopes(loop, *jax.device_put((q, v))))
+def _largest(slopes: Float[np.ndarray, "points n n"]) -> float:
+    """Largest magnitude of an eigenvalue; zero where no slope is finite."""
     usable = slopes[np.isfinite(slopes).all(axis=(1, 2))]
     return float(np.abs(np.linalg.eigvals(usable)).max()) if len(usable) else 0.0
 

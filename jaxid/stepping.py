@@ -73,6 +73,7 @@ class Stepping(eqx.Module):
     - `control`: a diffrax step-size controller; None for fixed steps, which are the fastest.
     - `adjoint`: of each adaptive solve; fixed steps are differentiated directly.
     - `interpolation`: of the reference between samples, `"cubic"`, `"linear"` or `"hold"`.
+    - `settled`: whether jaxid has chosen `substeps`, and may choose more; no setting of a user's.
     """
 
     solver: diffrax.AbstractSolver = RK4()
@@ -80,6 +81,7 @@ class Stepping(eqx.Module):
     control: diffrax.AbstractStepSizeController | None = None
     adjoint: diffrax.AbstractAdjoint = diffrax.ForwardMode()
     interpolation: Literal["cubic", "linear", "hold"] = eqx.field(static=True, default="cubic")
+    settled: bool = eqx.field(static=True, default=False)
 
 
 def flow(

@@ -229,7 +229,10 @@ def test_superfluous_effect_is_taken_out_and_a_needed_one_stays(offset_case, off
     assert removed == (("quadratic_drag", 1),)
     assert [s.added.effect_name() for s in left[1:]] == ["torque_offset"]
     assert "drag" not in repr(left[-1].fit.loop)
-    assert search.prune(with_chain(search, start, offset, drag), silent)[1] == ()
+    left, removed = search.prune(with_chain(search, start, offset, drag), silent)
+    assert removed == (("quadratic_drag", 1),)
+    assert [s.added.effect_name() for s in left[1:]] == ["torque_offset"]
+    assert left[-1].fit.loop.effects[-1].effect_name() == "torque_offset"
 
 
 @pytest.mark.xdist_group("offset")

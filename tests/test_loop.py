@@ -544,4 +544,11 @@ def test_a_bristle_at_speed_asks_for_smaller_steps(lengths):
     substeps = with_substeps(stiff, recordings).stepping.substeps
     # Runge and Kutta's fourth order runs away at 2.8 over the rate, which is speed over slide.
     assert 0.01 * speed / 6e-4 / substeps < 2.8
+    # What was settled for a loop without it counts no longer; what a user has set does.
+    before = with_substeps(jaxid.scara(), recordings)
+    effect = stiff.effects[-1]
+    assert with_substeps(before.add(effect), recordings).stepping.substeps > 4
+    assert with_substeps(before, recordings).stepping == before.stepping
+    set_by_user = dataclasses.replace(stiff, stepping=jaxid.Stepping(substeps=5))
+    assert with_substeps(set_by_user, recordings).stepping.substeps == 5
     assert all(np.isfinite(run.tau).all() for run in jaxid.simulate(stiff, recordings))

@@ -390,6 +390,11 @@ def diagnose(
         proposed += [(curve, 1.0) for curve in curves(scene, linear.motion)]
         row = {"tau": 0, "q": 1}[output]
         hypotheses, table = signatures(loop, batch, linear, proposed, row, say)
+        if not np.isfinite(table).all():
+            raise FitError(
+                f"{loop.name} runs away once it is linearised along these recordings: take smaller "
+                "steps, jaxid.Stepping(substeps=...)"
+            )
         data = Data(residual, base, _at_samples(batch, table), np.asarray(batch.kept))
         say(f"scoring {len(hypotheses)} hypotheses")
         try:

@@ -452,10 +452,10 @@ class _Search(eqx.Module):
                 break
             gone = steps[place].added
             assert gone is not None
-            again = self.step(
-                final.label, found, added=final.added, alike=final.alike, contenders=()
-            )
-            between = [s for k, s in enumerate(steps[:-1]) if k != place]
+            # The step that is last once this one has gone.
+            stays = steps[-2] if steps[place] is final else final
+            again = self.step(stays.label, found, added=stays.added, alike=stays.alike)
+            between = [s for s in steps if s is not stays and s is not steps[place]]
             if rival is None:
                 removed.append((gone.effect_name(), getattr(gone, "joint", None)))
             else:
@@ -468,14 +468,18 @@ class _Search(eqx.Module):
     def changed(
         self, steps: Sequence[Step], say: Callable[[str], None]
     ) -> list[tuple[float, int, Contender | None, Fit]]:
-        """The last model without each earlier effect, and with each one's rivals in its place.
+        """The last model without each effect, and with each earlier one's rivals in its place.
+
+        Without the last as well: what it made up for may have come right as the others settled.
 
         **Returns:** criterion, number of the step, the rival if there is one, and the fit.
         """
         final, found = steps[-1], []
         added = [k for k, s in enumerate(steps) if s.added is not None]
-        for at, k in enumerate(added[:-1]):
-            for rival in (None, *_rivals(steps[k])):
+        if len(added) < 2:
+            return []
+        for at, k in enumerate(added):
+            for rival in (None, *(() if steps[k] is final else _rivals(steps[k]))):
                 refitted = self.replaced(final, len(added) - at, rival, say)
                 value = self.criterion(refitted, final.diagnosis)
                 found.append((value, k, rival, refitted))

@@ -104,7 +104,7 @@ class OEM(AbstractMethod):
             finer = _too_coarse(done)
             if finer is not None and time.perf_counter() < deadline:
                 say(f"again with {finer} steps between samples")
-                finer_loop = set_substeps(done.loop, finer)
+                finer_loop = set_substeps(done.loop, finer, settled=True)
                 done = _converge(self, finer_loop, kept, say, deadline=deadline)
         found = _report(self, done, kept, time.perf_counter() - started)
         return dataclasses.replace(found, notes=(*found.notes, *_left_out(recordings, kept)))
