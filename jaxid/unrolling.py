@@ -179,7 +179,7 @@ class _Writer:
             shape = [1] * len(p["shape"])
             shape[p["dimension"]] = -1
             count = np.arange(p["shape"][p["dimension"]]).astype(p["dtype"])
-            return _objects(np.broadcast_to(count.reshape(shape), p["shape"]))
+            return _Value.of(np.broadcast_to(count.reshape(shape), p["shape"])).scalars()
         if name in ("scatter", "scatter-add", "scatter-mul"):
             return self.scattered(name, p, *inputs)
         return None
@@ -278,14 +278,6 @@ class _Writer:
             update = self.times(out[place], update)
         out[place] = update
         return out
-
-
-def _objects(array: np.ndarray) -> np.ndarray:
-    """The same numbers as scalars of NumPy, known when the program is made."""
-    out = np.empty(array.shape, object)
-    for at in np.ndindex(array.shape):
-        out[at] = array[at]
-    return out
 
 
 def _broadcast(p, x):

@@ -454,7 +454,10 @@ class _Search(eqx.Module):
             assert gone is not None
             # The step that is last once this one has gone.
             stays = steps[-2] if steps[place] is final else final
-            again = self.step(stays.label, found, added=stays.added, alike=stays.alike)
+            others_tried = () if stays is final else stays.contenders
+            again = self.step(
+                stays.label, found, added=stays.added, alike=stays.alike, contenders=others_tried
+            )
             between = [s for s in steps if s is not stays and s is not steps[place]]
             if rival is None:
                 removed.append((gone.effect_name(), getattr(gone, "joint", None)))
