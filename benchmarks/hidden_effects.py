@@ -1,7 +1,7 @@
 """The blind bench: hidden effects drawn anew, given to `jaxid.discover`, judged by the truth.
 
 python -m benchmarks.hidden_effects [--seed N] [--quick] [--json FILE] [--jobs 2] [--out DIR]
-                                    [--robot scara|two_link|axis]
+                                    [--robot scara|two_link|axis|any]
 """
 
 import argparse
@@ -30,6 +30,7 @@ from . import stepwise
 Key = tuple[str, int | None]
 KINDS = ("single", "double", "clean", "outside")
 COLOURS = ("white", "moderate", "strong")
+ROBOTS = ("scara", "two_link", "axis")
 WHOLE_ARM = ("payload", "gravity")
 TRANSMISSIONS = {"joint_elasticity", "backlash"}
 # Beyond this chance of noise alone, the recordings do not show an effect.
@@ -57,9 +58,13 @@ class Wanted:
 
 
 def draw_wanted(master: int, quick: bool = False, robot: str = "scara") -> list[Wanted]:
-    """The cases of one run, shuffled, so that a part of them says something of all."""
+    """The cases of one run, shuffled, so that a part of them says something of all.
+
+    With "any" robot, each case has one drawn from those on which its effects make sense.
+    """
     rng = np.random.default_rng(master)
-    there = sim.applicable(robot)
+    robots = ROBOTS if robot == "any" else (robot,)
+    there = {name for chosen in robots for name in sim.applicable(chosen)}
     known, strange = ([n for n in names if n in there] for names in (sim.CATALOGUE, sim.OUTSIDE))
     if quick:
         names = rng.choice(known, 5, replace=False).tolist()
@@ -79,9 +84,17 @@ def draw_wanted(master: int, quick: bool = False, robot: str = "scara") -> list[
     seeds = rng.integers(1, 2**31, len(plain)).tolist()
     order = rng.permutation(len(plain)).tolist()
     return [
-        Wanted(number, plain[k][0], seeds[k], plain[k][1], colours[k], robot)
+        Wanted(
+            number, plain[k][0], seeds[k], plain[k][1], colours[k], _robot(rng, robots, plain[k][1])
+        )
         for number, k in enumerate(order)
     ]
+
+
+def _robot(rng: np.random.Generator, robots: Sequence[str], names: Sequence[str]) -> str:
+    """One of the robots on which all these effects make sense."""
+    fit = [robot for robot in robots if set(names) <= set(sim.applicable(robot))]
+    return str(rng.choice(fit))
 
 
 def _pair(rng: np.random.Generator, known: Sequence[str]) -> tuple[str, ...]:
@@ -421,7 +434,8 @@ def _found(record: dict[str, Any]) -> str:
 
 def row(record: dict[str, Any]) -> str:
     """One line of the table."""
-    head = f"{record['number']:4d} {record['kind']:8s}{record['noise']:9s}{_true(record):52s}"
+    head = f"{record['number']:4d} {record['kind']:8s}{record['robot']:9s}{record['noise']:9s}"
+    head += f"{_true(record):52s}"
     if "error" in record:
         return f"{head}ERROR {record['error'].strip().splitlines()[-1]}"
     marks = record["marks"]
@@ -507,7 +521,10 @@ def show_summary(result: dict[str, Any]) -> None:
 
 def show_failure(record: dict[str, Any]) -> None:
     """Prints what a case was, what was found, and what an oracle finds."""
-    print(f"\n{record['number']} {record['kind']}, seed {record['seed']}, noise {record['noise']}")
+    print(
+        f"\n{record['number']} {record['kind']}, seed {record['seed']}, {record['robot']}, "
+        f"noise {record['noise']}"
+    )
     if "error" in record:
         print(record["error"])
         return
@@ -568,7 +585,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, help="file for all results")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, help="folder in which a stopped run goes on")
-    parser.add_argument("--robot", choices=("scara", "two_link", "axis"), default="scara")
+    parser.add_argument("--robot", choices=(*ROBOTS, "any"), default="scara")
     parser.add_argument("--only", choices=KINDS, help="cases of one kind")
     parser.add_argument("--case", type=int, action="append", help="only the case of this number")
     given = parser.parse_args(arguments)

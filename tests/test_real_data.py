@@ -111,6 +111,7 @@ def pendulum_fits(pendulum):
 
 
 @pytest.mark.parametrize("method", ["idim", "open loop", "tracking"])
+@pytest.mark.xdist_group("pendulum")
 def test_pendulum_by_each_method_is_near_the_authors(pendulum_fits, method):
     fit = pendulum_fits[method]
     assert fit.status is jaxid.Status.converged
@@ -121,6 +122,7 @@ def test_pendulum_by_each_method_is_near_the_authors(pendulum_fits, method):
         assert 0.8 < values[name] / value < 1.25, name
 
 
+@pytest.mark.xdist_group("pendulum")
 def test_pendulum_methods_agree(pendulum_fits):
     idim, tracking = pendulum_fits["idim"], pendulum_fits["tracking"]
     # The same torque, the same low-pass: a loop that follows a motion is its inverse dynamics.
@@ -130,6 +132,7 @@ def test_pendulum_methods_agree(pendulum_fits):
     assert np.all(next(pair) < 1.15 * next(pair))
 
 
+@pytest.mark.xdist_group("pendulum")
 def test_pendulum_beats_the_authors_on_an_unseen_recording(pendulum, pendulum_fits):
     fitting, unseen = pendulum
     held = jaxid.two_link(Tracking(cutoff=8.0), link_length=0.3).hold(**AUTHORS)
@@ -143,6 +146,7 @@ def test_pendulum_beats_the_authors_on_an_unseen_recording(pendulum, pendulum_fi
     assert ours["joint 1"] < 1.02 * theirs["joint 1"]
 
 
+@pytest.mark.xdist_group("pendulum")
 def test_pendulum_in_the_open_follows_an_unseen_recording(pendulum, pendulum_fits):
     fitting, unseen = pendulum
     held = jaxid.two_link(OpenLoop(), link_length=0.3).hold(**AUTHORS)
