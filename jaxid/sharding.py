@@ -38,14 +38,16 @@ def shares_of(count: int, parts: int) -> list[Int[np.ndarray, " rows"]]:
     return [np.minimum(np.arange(k, k + size), count - 1) for k in range(0, count, size)]
 
 
-def at_once(fun: Callable[[Given], Result], parts: Sequence[Given]) -> list[Result]:
-    """The function of each part, by as many threads as there are cores.
+def at_once(
+    fun: Callable[[Given], Result], parts: Sequence[Given], threads: int | None = None
+) -> list[Result]:
+    """The function of each part, by some threads; as many as there are cores if not said.
 
     XLA runs a loop on the core of its caller, and compiles without holding Python's lock.
     """
     if not parts:
         return []
-    with ThreadPoolExecutor(min(len(parts), cores())) as pool:
+    with ThreadPoolExecutor(min(len(parts), threads or cores())) as pool:
         return list(pool.map(lambda part: jax.block_until_ready(fun(part)), parts))
 
 

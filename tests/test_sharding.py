@@ -6,6 +6,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import jax
@@ -94,6 +95,22 @@ def test_cores_that_share_recordings_give_the_linearisation_of_one(law, monkeypa
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(shared), strict=True):
         assert a.shape == b.shape
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.max(np.abs(a), initial=0.0))
+
+
+def test_a_mesh_of_one_host_device_takes_its_shares_on_one_thread(monkeypatch):
+    problem, theta, start = _problem(jaxid.scara(), jaxid.read(*FILES))
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("recordings",))
+    threads = []
+
+    def spy(part, theta, start):
+        threads.append(threading.get_ident())
+        return point_around(part, theta, start)
+
+    monkeypatch.setattr(least_squares, "_AT_A_TIME", 1)
+    monkeypatch.setattr(least_squares, "point_around", spy)
+    linearise(dataclasses.replace(problem, mesh=mesh), theta, start)
+    assert len(threads) == 3
+    assert len(set(threads)) == 1
 
 
 def test_new_weights_need_no_simulation():

@@ -352,7 +352,7 @@ def linearisation(problem: Problem) -> Callable[[Array, Array], Point]:
     shares = shares_of(recordings, threads * rounds)
     if len(shares) == 1:
         return lambda theta, start: point_around(problem, theta, start)
-    return _Shared([_share(problem, rows) for rows in shares], shares)
+    return _Shared([_share(problem, rows) for rows in shares], shares, threads)
 
 
 # Samples in all from which on threads gain more than they cost.
@@ -362,10 +362,11 @@ _AT_A_TIME = 40_000
 
 
 class _Shared(eqx.Module):
-    """The linearisation of all recordings by shares, which cores take in turn."""
+    """The linearisation of all recordings by shares, which threads take in turn."""
 
     parts: list[Problem]
     rows: list[Int[np.ndarray, " rows"]]
+    threads: int
 
     def __call__(
         self, theta: Float[Array, " parameters"], start: Float[Array, "recordings initials"]
@@ -377,7 +378,7 @@ class _Shared(eqx.Module):
             found.put(k, (point.found, point.start_gram, point.start_slope, point.cross))
             return point.loss, point.gram, point.slope
 
-        sums = at_once(part, range(len(self.parts)))
+        sums = at_once(part, range(len(self.parts)), self.threads)
         by_recording, *products = found.whole(start.shape[0])
         loss, gram, slope = (jnp.asarray(np.sum(x, axis=0)) for x in zip(*sums, strict=True))
         return Point(theta, start, by_recording, loss, gram, slope, *products)
