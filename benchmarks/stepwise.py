@@ -81,11 +81,14 @@ def _enter(rows: Rows, basis: np.ndarray) -> tuple[Entry | None, np.ndarray]:
         own = _basis(block, basis)
         if own.shape[1] == 0:
             continue
+        spare = count - basis.shape[1] - own.shape[1]
+        if spare <= 0:
+            continue
         taken = float(np.sum((own.T @ rest) ** 2))
-        bic = count * np.log(max(left - taken, 1e-12 * left)) + own.shape[1] * np.log(count)
+        still = max(left - taken, 1e-12 * left)
+        bic = count * np.log(still) + own.shape[1] * np.log(count)
         if bic < price:
-            spare = count - basis.shape[1] - own.shape[1]
-            f = taken / own.shape[1] / ((left - taken) / spare)
+            f = taken / own.shape[1] / (still / spare)
             best = Entry(key, float(stats.f.sf(f, own.shape[1], spare)))
             price, grown = bic, np.concatenate([basis, own], axis=1)
     return best, grown

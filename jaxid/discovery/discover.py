@@ -372,15 +372,16 @@ class _Search(eqx.Module):
         found.append(grown(effect))
         if not effect.contact:
             # Output error, by the program that filters need anyway.
-            white = tuple(ARFilter(np.zeros(0), 1.0) for _ in last.diagnosis.noise)
+            noise = last.diagnosis.noise
+            white = tuple(ARFilter(np.zeros(0), f.variance * f.gain) for f in noise)
             method = dataclasses.replace(self.whitened_method(last.diagnosis), filters=white)
             return [*found, fit(found[0], self.recordings, method).loop]
         held = _held_shapes(found[0])
         plain = dataclasses.replace(_quiet(self.method), start="given")
-        return found + [
-            fit(grown(effect.scaled(factor)).free(*held), self.recordings, plain).loop
-            for factor in (1.0, wide)
-        ]
+        apart = [grown(effect.scaled(factor)).free(*held) for factor in (1.0, wide)]
+        fits = [fit(loop, self.recordings, plain) for loop in apart]
+        lost = (Status.misfit, Status.diverged)
+        return found + [fitted.loop for fitted in fits if fitted.status not in lost]
 
     def settled(self, best: Contender, say: Callable[[str], None]) -> Contender:
         """The best contender with noise filters of its own, and its held shapes if they matter.

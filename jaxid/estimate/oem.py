@@ -105,7 +105,9 @@ class OEM(AbstractMethod):
             if finer is not None and time.perf_counter() < deadline:
                 say(f"again with {finer} steps between samples")
                 finer_loop = set_substeps(done.loop, finer, settled=True)
-                done = _converge(self, finer_loop, kept, say, deadline=deadline)
+                done = _converge(
+                    self, finer_loop, kept, say, deadline=deadline, weights=done.weights
+                )
         found = _report(self, done, kept, time.perf_counter() - started)
         return dataclasses.replace(found, notes=(*found.notes, *_left_out(recordings, kept)))
 
@@ -298,6 +300,7 @@ def _converge(
     say: Callable[[str], None],
     filters: Noise = None,
     deadline: float = math.inf,
+    weights: Float[Array, " outputs"] | None = None,
 ) -> _Done:
     """Minimises, then again with the weights and initial states that follow, until they settle.
 
@@ -305,23 +308,32 @@ def _converge(
 
     - `filters`: noise filter of each output; white noise where None.
     - `deadline`: of `time.perf_counter`; past it, what there is is given.
+    - `weights`: to begin with, if they are about known; filters know theirs.
     """
     pieces = pieces_of(recordings, method.window)
     signals = _signals(method, loop)
     batch = prepare(loop, pieces)
     free = jnp.asarray(_free_starts(method, pieces, batch))
-    first = weights = jnp.asarray(_first_weights(loop, pieces, signals))
+    first = jnp.asarray(_first_weights(loop, pieces, signals))
     bounds = Bounds.of(loop.free_parameters)
     start = jnp.asarray(np.concatenate([batch.q0, batch.v0], axis=1))
-    total, minimum, problem, ratio = 0, None, None, jnp.ones_like(first)
+    if weights is None and filters is not None:
+        weights = _weights_of(filters, first)
+    # The weight of a lone output is but its unit.
+    alone = len(first) == 1
     # Until the weights are known, a rough minimum is enough.
-    worth = 1e-2
-    for _ in range(20):
+    worth = 1e-4 if alone or weights is not None else 1e-2
+    weights = first if weights is None else weights
+
+    def posed(weights: Float[Array, " outputs"]) -> Problem:
         within = bounds.lower, bounds.upper
         noise = jnp.asarray(_taps(filters, weights))
         kinds = signals, bool(free.any()), method.mesh
         mix = _mix(filters, weights)
-        problem = Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix)
+        return Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix)
+
+    total, minimum, problem, ratio = 0, None, posed(weights), jnp.ones_like(first)
+    for _ in range(20):
         left = method.max_steps - total
         known = None if minimum is None else reweighted(problem, minimum.point, ratio)
         minimum = minimise(
@@ -338,15 +350,26 @@ def _converge(
             # Only rounding is left, in which no step finds less.
             minimum = dataclasses.replace(minimum, status=Status.converged)
         settled = bool(np.all(np.abs(np.asarray(new) / np.asarray(weights) - 1) < 0.1))
-        if (settled and worth < 1e-2) or total >= method.max_steps:
+        ended = total >= method.max_steps or minimum.status is Status.max_seconds
+        if ended or (settled and worth < 1e-2):
             break
-        if minimum.status is Status.max_seconds:
+        ratio, weights, worth = new / weights, new, 1e-4 if settled else worth
+        problem = posed(weights)
+        if alone:
+            there = reweighted(problem, minimum.point, ratio)
+            minimum = dataclasses.replace(minimum, point=there)
             break
-        ratio = new / weights
-        weights, worth = new, 1e-4 if settled else worth
     assert minimum is not None
-    assert problem is not None
     return _Done(loop, pieces, batch, problem.weights, minimum, problem, signals, total)
+
+
+def _weights_of(filters: Noise, first: Float[Array, " outputs"]) -> Float[Array, " outputs"]:
+    """One over the deviation of what each filter leaves, with a floor of the signal's size."""
+    if isinstance(filters, VectorAR):
+        variance = np.diag(filters.covariance)
+    else:
+        variance = np.array([f.variance for f in filters or ()])
+    return jnp.asarray(1 / np.maximum(np.sqrt(variance), _FLOOR / np.asarray(first)))
 
 
 def _taps(filters: Noise, weights: Float[Array, " outputs"]) -> Float[np.ndarray, "..."]:
