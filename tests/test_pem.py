@@ -86,6 +86,21 @@ def test_filters_are_those_of_the_noise_and_leave_white_innovations(fits):
         assert np.all(table["innovations_p"] > 1e-3)
 
 
+def test_filters_that_are_known_need_one_minimum(fits, recording, monkeypatch):
+    done = fits["sep"]
+    calls = []
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return ls.minimise(*arguments)
+
+    monkeypatch.setattr("jaxid.estimate.oem.minimise", counted)
+    again = jaxid.fit(jaxid.scara(), recording, jaxid.SeparablePEM(GIVEN, filters=done.noise))
+    assert len(calls) == 1
+    assert np.all(np.abs(again.theta - done.theta) < 0.05 * done.std)
+    np.testing.assert_allclose(again.std, done.std, rtol=0.01)
+
+
 def test_the_noise_model_buys_precision(fits):
     ratio = fits["sep"].std / fits["oem"].std
     assert np.all(ratio < 1.15)
