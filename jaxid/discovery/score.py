@@ -44,6 +44,20 @@ class Data(eqx.Module):
             out /= level.reshape(*level.shape, *(1,) * (x.ndim - 3))
         return out
 
+    def middle(self, most: int) -> "Data":
+        """The middle of each recording, so that no more than `most` rows are left in all."""
+        recordings, samples, outputs = self.residual.shape
+        length = max(1, most // (recordings * outputs))
+        if length >= samples:
+            return self
+        spare = np.maximum(self.mask.sum(axis=1) - length, 0)
+        first = np.minimum(np.argmax(self.mask, axis=1) + spare // 2, samples - length)
+
+        def cut(rows: np.ndarray) -> np.ndarray:
+            return np.stack([r[at : at + length] for r, at in zip(rows, first, strict=True)])
+
+        return Data(cut(self.residual), cut(self.base), cut(self.table), cut(self.mask), self.level)
+
 
 def whitened(
     x: Float[np.ndarray, "recordings samples outputs *columns"],
@@ -111,7 +125,11 @@ class Whitened(eqx.Module):
         basis = basis[:, values > 1e-9 * values[0]] if len(values) else basis
         r = r - basis @ (basis.T @ r)
         single = basis.astype(x.dtype)
-        x -= single @ (single.T @ x)
+        across = single.T @ x
+        # By parts: the whole product would be as large as the table once more.
+        parts = 1 + len(x) // 10_000
+        for some, of in zip(np.array_split(x, parts), np.array_split(single, parts), strict=True):
+            some -= of @ across
         unknown = len(data.mask) * sum(f.order for f in noise)
         count = data.mask.sum() * data.residual.shape[2] - unknown - basis.shape[1]
         return cls(r, x, size.astype(float), float(count))

@@ -16,7 +16,7 @@ from ..errors import ModelError
 from ..loop import ClosedLoop, effect_loads
 from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..recording import Recordings
-from ..sharding import at_once
+from ..sharding import at_once, taken
 from ..simulate import Batch, each, initial, run, with_rolled_stages
 from .linear import Linearised, respond
 
@@ -217,22 +217,39 @@ def _all_forces(
 ) -> Forces:
     """Forces of all hypotheses: one trace for each structure, `vmap` over its settings.
 
-    It does not know the loop, so that it is compiled once however the model grows.
+    It does not know the loop, so that it is compiled once however the model grows. What is added to
+    sensors is of those effects alone that act there.
     """
 
     def of_run(run: Motion, left) -> Forces:
-        made = []
+        pushes, noises, rates = [], [], []
         for stacked in groups:
             forces = eqx.filter_vmap(
                 lambda effect: _forces(effect, run, left), in_axes=eqx.if_array(0)
             )(stacked)
-            # (settings, points, joints, columns) to (points, joints, settings · columns)
-            made.append(
-                jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2).reshape(*x.shape[1:3], -1), forces)
-            )
-        return jax.tree.map(lambda *x: jnp.concatenate(x, -1).astype(jnp.float32), *made)
+            push, noise, rate = (_by_point(x.astype(jnp.float32)) for x in forces)
+            pushes.append(push)
+            if _misreads(stacked):
+                noises.append(noise)
+                rates.append(rate)
+        none = [jnp.zeros((*left.shape, 0), jnp.float32)]
+        return (
+            jnp.concatenate(pushes, -1),
+            jnp.concatenate(noises or none, -1),
+            jnp.concatenate(rates or none, -1),
+        )
 
     return jax.vmap(of_run)(motion, left)
+
+
+def _by_point(x: Float[Array, "settings points joints columns"]) -> Float[Array, "..."]:
+    """`(points, joints, settings · columns)`."""
+    return jnp.moveaxis(x, 0, 2).reshape(*x.shape[1:3], -1)
+
+
+def _misreads(effect: AbstractEffect) -> bool:
+    """Whether the effect is one of the sensors."""
+    return type(effect).read is not AbstractEffect.read
 
 
 def _grouped(effects: Sequence[AbstractEffect]) -> list[tuple[AbstractEffect, list[int]]]:
@@ -265,6 +282,42 @@ def _finite(
     return jnp.moveaxis(eqx.filter_vmap(setting, in_axes=eqx.if_array(0))(stacked), 0, -1)
 
 
+def _responses(
+    loop: ClosedLoop,
+    linear: Linearised,
+    stacks: list[AbstractEffect],
+    hypotheses: Sequence[Hypothesis],
+) -> Float[np.ndarray, "recordings points outputs columns"]:
+    """What effects that are inputs of the linear system show, one run after the other.
+
+    The forces of all runs at once would be several times as large as the table.
+    """
+    reading = _columns(hypotheses, _misreads)
+    behind = _columns(hypotheses, lambda e: e.on_link) if "pull" in linear.places else []
+    left = _left_for_links(loop, linear.motion)
+
+    def along(k: int) -> Float[np.ndarray, "points outputs columns"]:
+        alone, remaining = taken((linear, left), np.array([k]))
+        push, noise, rate = _all_forces(stacks, alone.motion, remaining)
+        table = np.array(respond(alone, "push", push))
+        if reading:
+            table[..., reading] += respond(alone, "noise", noise)
+            table[..., reading] += respond(alone, "rate", rate)
+        if behind:
+            table[..., behind] = respond(alone, "pull", push[..., np.array(behind)])
+        return table[0]
+
+    # The first compiles what the others, which share the cores, then find.
+    first = along(0)
+    return np.stack([first, *at_once(along, range(1, len(left)))])
+
+
+def _columns(
+    hypotheses: Sequence[Hypothesis], which: Callable[[AbstractEffect], bool]
+) -> list[int]:
+    return [c for h in hypotheses if which(h.effect) for c in h.columns]
+
+
 def signatures(
     loop: ClosedLoop,
     batch: Batch,
@@ -284,13 +337,6 @@ def signatures(
     groups = _grouped([proposed[k][0] for k in direct])
     if groups:
         say(f"{len(direct)} signatures by linear response")
-        left = _left_for_links(loop, linear.motion)
-        push, noise, rate = _all_forces([stacked for stacked, _ in groups], linear.motion, left)
-        table = np.array(respond(linear, "push", push))
-        reading = np.flatnonzero(np.asarray(jnp.any(noise != 0, axis=(0, 1, 2))))
-        if len(reading):
-            table[..., reading] += respond(linear, "noise", noise[..., reading])
-            table[..., reading] += respond(linear, "rate", rate[..., reading])
         for _, places in groups:
             low, high = _amplitude_bounds(proposed[direct[places[0]]][0])
             for place in places:
@@ -298,10 +344,8 @@ def signatures(
                 columns = tuple(range(at, at + len(low)))
                 made[direct[place]] = Hypothesis(effect, columns, low, high, tests)
                 at += len(low)
-        behind = [c for h in made.values() if h.effect.on_link for c in h.columns]
-        if "pull" in linear.places and behind:
-            table[..., behind] = respond(linear, "pull", push[..., np.array(behind)])
-        blocks.append(table)
+        stacks = [stacked for stacked, _ in groups]
+        blocks.append(_responses(loop, linear, stacks, list(made.values())))
     rest = [k for k in range(len(proposed)) if k not in made]
     groups = _grouped([proposed[k][0] for k in rest])
     say(f"{len(rest)} signatures by simulation")
