@@ -237,8 +237,13 @@ def chi_squared(case: sim.Case, fit: jaxid.Fit, held_out: jaxid.Recordings) -> d
 def oracle(case: sim.Case, without: Sequence[int], fitting: jaxid.Recordings) -> jaxid.Fit:
     """The fit of who knows the truth: its effects but some, from its values."""
     keep = [e for k, e in enumerate(case.effects) if k not in without]
-    base = {name: getattr(case.plant, name) for name in case.plant.base}
-    loop = start_model(case).with_values(**base).add(*(in_jaxid(e, case.plant) for e in keep))
+    loop = start_model(case)
+    # The one joint of an axis has friction without a number in its plant, and with one in the loop.
+    base = {
+        name if name in loop.names else f"{name}1": getattr(case.plant, name)
+        for name in case.plant.base
+    }
+    loop = loop.with_values(**base).add(*(in_jaxid(e, case.plant) for e in keep))
     return jaxid.fit(loop, fitting, jaxid.OEM(start="given", progress=False))
 
 

@@ -177,6 +177,13 @@ Forces = tuple[
 ]
 
 
+AllForces = tuple[
+    Float[Array, "*points joints columns"],
+    Float[Array, "*points joints reading"],
+    Float[Array, "*points joints reading"],
+]
+
+
 def _forces(effect: AbstractEffect, motion: Motion, left: Float[Array, "points joints"]) -> Forces:
     """What the effect adds to joint torque, position read and velocity read, by amplitude."""
     linear = amplitudes(effect)
@@ -214,14 +221,14 @@ def _all_forces(
     groups: list[AbstractEffect],
     motion: Motion,
     left: Float[Array, "recordings points joints"],
-) -> Forces:
+) -> AllForces:
     """Forces of all hypotheses: one trace for each structure, `vmap` over its settings.
 
     It does not know the loop, so that it is compiled once however the model grows. What is added to
     sensors is of those effects alone that act there.
     """
 
-    def of_run(run: Motion, left) -> Forces:
+    def of_run(run: Motion, left) -> AllForces:
         pushes, noises, rates = [], [], []
         for stacked in groups:
             forces = eqx.filter_vmap(
