@@ -137,6 +137,10 @@ def test_results_show_themselves(bump_story):
     diagnosis = bump_story.steps[0].diagnosis
     assert {"effect", "joint", "p_value", "amplitude"} <= set(diagnosis.table().columns)
     assert diagnosis.where_table().iloc[0]["coordinate"] == "q2"
+    # A story keeps the signatures of its rankings alone; those of all curves are far more.
+    assert diagnosis.data.table.shape[-1] < 0.5 * len(diagnosis.gram.score)
+    with pytest.raises(jaxid.errors.FitError, match="diagnose"):
+        diagnosis.predicted_error(diagnosis.where[0])
     for figure in (
         diagnosis.plot(),
         diagnosis.plot_where(),

@@ -103,6 +103,11 @@ class Diagnosis(AbstractShown):
         """Whether nothing significant is left, neither for the catalogue nor for a curve."""
         return all(v.p_value > self.significance for v in (*self.ranking[:1], *self.where[:1]))
 
+    def light(self) -> "Diagnosis":
+        """The same with the signatures of the ranking alone: all of them are large."""
+        ranked = sorted({c for v in self.ranking for c in v.hypothesis.columns})
+        return dataclasses.replace(self, data=self.data.only(ranked))
+
     def predicted(self, verdict: Verdict) -> AbstractEffect:
         """An effect with the amplitudes that its signature predicts."""
         effect, columns = verdict.hypothesis.effect, verdict.hypothesis.columns
@@ -215,9 +220,8 @@ class Diagnosis(AbstractShown):
         for verdict in self.ranking[:contenders]:
             columns = list(verdict.hypothesis.columns)
             values, _ = self.gram.amplitude(columns)
-            shares[_label(verdict)] = (
-                self.data.table[recording, :, joint - 1, columns].T @ values
-            )[keep]
+            signature = self.data.columns(columns)[recording, keep, joint - 1]
+            shares[_label(verdict)] = signature @ values
         record = self.fit.recordings[recording]
         residual = self.data.residual[recording, keep, joint - 1]
         time = record.time if len(record.time) == len(residual) else np.arange(len(residual)) * 1.0

@@ -171,7 +171,7 @@ class _Search(eqx.Module):
             found, catalogue=self.catalogue, significance=self.significance, progress=False
         )
         held = None if self.held_out is None else compare(found, self.held_out)
-        return Step(label, found, held, diagnosis, **extra)
+        return Step(label, found, held, diagnosis.light(), **extra)
 
     def turn(
         self, steps: list[Step], most: int, say: Callable[[str], None]

@@ -1,5 +1,6 @@
 """Score statistics: what each hypothesis explains of the whitened residual, and by what chance."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -7,6 +8,7 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
 
+from ..errors import FitError
 from ..noise import ARFilter
 
 Rows = Float[np.ndarray, "recordings samples outputs"]
@@ -19,7 +21,8 @@ class Data(eqx.Module):
     `base` are the columns that the model's own parameters and initial states can absorb, `table`
     the signatures, `mask` says which samples are there. Signatures are of single precision: they
     are many, and to be told from noise they need three digits. `level` is how loud noise is in each
-    recording beside the mean of all; None where they are alike.
+    recording beside the mean of all; None where they are alike. `kept` are the numbers of the
+    columns that are in the table; None where all of them are.
     """
 
     residual: Rows
@@ -27,6 +30,27 @@ class Data(eqx.Module):
     table: Float[np.ndarray, "recordings samples outputs columns"]
     mask: Bool[np.ndarray, "recordings samples"]
     level: Float[np.ndarray, "recordings outputs"] | None = None
+    kept: tuple[int, ...] | None = eqx.field(static=True, default=None)
+
+    def columns(
+        self, numbers: Sequence[int]
+    ) -> Float[np.ndarray, "recordings samples outputs columns"]:
+        """Signatures by their numbers.
+
+        **Raises:** `FitError` where they have not been kept.
+        """
+        if self.kept is None:
+            return self.table[..., list(numbers)]
+        if not set(numbers) <= set(self.kept):
+            raise FitError(
+                "a story keeps the signatures of its rankings alone: jaxid.diagnose(step.fit) has "
+                "all of them"
+            )
+        return self.table[..., [self.kept.index(number) for number in numbers]]
+
+    def only(self, numbers: Sequence[int]) -> "Data":
+        """The same with these columns of the table alone."""
+        return dataclasses.replace(self, table=self.columns(numbers), kept=tuple(numbers))
 
     def series(self, rows: Rows, output: int) -> list[np.ndarray]:
         """One output's rows, one series a recording, all at the same level of noise."""
@@ -56,7 +80,13 @@ class Data(eqx.Module):
         def cut(rows: np.ndarray) -> np.ndarray:
             return np.stack([r[at : at + length] for r, at in zip(rows, first, strict=True)])
 
-        return Data(cut(self.residual), cut(self.base), cut(self.table), cut(self.mask), self.level)
+        return dataclasses.replace(
+            self,
+            residual=cut(self.residual),
+            base=cut(self.base),
+            table=cut(self.table),
+            mask=cut(self.mask),
+        )
 
 
 def whitened(

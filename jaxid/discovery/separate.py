@@ -128,7 +128,7 @@ def levelled(
 
 def leftover(data: Data, noise: Sequence[ARFilter], columns: Sequence[int]) -> Rows:
     """The residual less the best combination of base and some signatures, whitened by `noise`."""
-    picked = data.table[..., list(columns)].astype(float)
+    picked = data.columns(columns).astype(float)
     wide = np.concatenate([data.base, picked], axis=-1)
     w = data.white(wide, noise).reshape(-1, wide.shape[-1])
     r = data.white(data.residual, noise).reshape(-1)
