@@ -72,19 +72,21 @@ def test_the_middle_of_recordings_stays_within_their_samples():
     mask = data.mask.copy()
     mask[1, 150:] = False
     data = dataclasses.replace(data, mask=mask)
-    part = data.middle(200)
+    part = data.middle(200, least=1)
     assert part.residual.shape == (2, 100, 1)
     assert part.mask.all()
     np.testing.assert_array_equal(part.residual[0], data.residual[0, 100:200])
     np.testing.assert_array_equal(part.table[1], data.table[1, 25:125])
-    assert data.middle(600) is data
+    assert data.middle(600, least=1) is data
+    # Short pieces stay whole, however many they are.
+    assert data.middle(200) is data
 
 
 def test_the_middle_tells_the_same_noise_and_physics():
     blocks = [(0,), (1,), (2,), (3,)]
     data = drawn(np.random.default_rng(14), (1.0, 2.0))
     seen = dataclasses.replace(data, residual=data.residual + 3.0 * data.table[..., 2])
-    whole, part = estimate_noise(seen, blocks), estimate_noise(seen.middle(400), blocks)
+    whole, part = estimate_noise(seen, blocks), estimate_noise(seen.middle(400, least=1), blocks)
     assert whole.chosen == part.chosen == [2]
     assert abs(part.noise[0].variance / whole.noise[0].variance - 1) < 0.3
     np.testing.assert_allclose(part.data.level, whole.data.level, rtol=0.2)

@@ -68,10 +68,16 @@ class Data(eqx.Module):
             out /= level.reshape(*level.shape, *(1,) * (x.ndim - 3))
         return out
 
-    def middle(self, most: int) -> "Data":
-        """The middle of each recording, so that no more than `most` rows are left in all."""
+    def middle(self, most: int, least: int = 1000) -> "Data":
+        """The middle of each recording, so that no more than `most` rows are left in all.
+
+        **Arguments:**
+
+        - `least`: samples of each that are left in any case: of many short pieces, next to nothing
+          would be left of each once its noise filter is filled.
+        """
         recordings, samples, outputs = self.residual.shape
-        length = max(1, most // (recordings * outputs))
+        length = max(least, most // (recordings * outputs))
         if length >= samples:
             return self
         spare = np.maximum(self.mask.sum(axis=1) - length, 0)
