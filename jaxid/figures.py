@@ -539,29 +539,31 @@ def shares_in_time(
     unit: str = "N·m",
     title: str | None = None,
 ) -> go.Figure:
-    """Draw a residual with what the shares explain of it together, each share, and the rest.
+    """Draw a residual with what the first rival explains of it, each rival's share, and the rest.
 
     Arguments:
         time: Sampling times in s, shape `(samples,)`.
         residual: In `unit`, shape `(samples,)`.
-        shares: What each effect explains of it, in `unit`, shape `(samples,)`, by its name.
+        shares: What each rival alone explains of it, in `unit`, shape `(samples,)`, by its name,
+            the leading one first.
         unit: As printed.
         title: Of the whole figure.
     """
-    together = np.sum(list(shares.values()), axis=0, initial=0.0) + np.zeros_like(residual)
+    # Rivals stand in for each other: to add them up would explain the same thing twice.
+    leading, explained = next(iter(shares.items()), ("nothing", np.zeros_like(residual)))
     figure = go.Figure().set_subplots(
         rows=3, cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=[1.0, 1.0, 0.6]
     )
     whole = [
         Trace("residual", residual, unit, "measured"),
-        Trace("explained", together, unit, "simulated"),
+        Trace(f"explained by {leading}", explained, unit, "simulated"),
     ]
     _add_panel(figure, time, whole, 1)
     for (name, share), colour, dash in zip(shares.items(), cycle(PALETTE[2:]), cycle(DASHES)):
         x, y = _decimated(*_broken_at_gaps(time, share))
         line = {"color": colour, "dash": dash, "width": 1.6}
         figure.add_scatter(x=x, y=y, name=name, mode="lines", line=line, row=2, col=1)
-    rest = Trace("rest", residual - together, unit, "residual")
+    rest = Trace("rest", residual - explained, unit, "residual")
     _add_panel(figure, time, [rest], 3)
     for row, name in enumerate(("residual", "share", "rest"), start=1):
         figure.update_yaxes(title_text=_with_unit(name, unit), row=row, col=1)

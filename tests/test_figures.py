@@ -93,7 +93,7 @@ DRAWINGS = {
     "dependence": (_dependence, ["residual", "confidence band", "mean"]),
     "parameters": (_parameters, ["estimate ± 2σ", "reference"]),
     "ranking": (_ranking, ["significant", "not significant"]),
-    "shares": (_shares, ["residual", "explained", "stribeck", "spring", "rest"]),
+    "shares": (_shares, ["residual", "explained by stribeck", "stribeck", "spring", "rest"]),
 }
 # Axes of names or of pure numbers; every other axis names its unit.
 WITHOUT_UNIT = {"autocorrelation", "joint", "step", "parameter", "candidate"}
@@ -109,6 +109,12 @@ def _shown_axes(figure: go.Figure, letter: str) -> list[dict]:
     layout = figure.to_dict()["layout"]
     axes = [value for key, value in layout.items() if key.startswith(f"{letter}axis")]
     return [axis for axis in axes if axis.get("showticklabels", True)]
+
+
+def test_rivals_are_not_added_up():
+    top = {t.name: np.nanmax(np.abs(np.asarray(t.y, float))) for t in _shares().data}
+    assert np.isclose(top["explained by stribeck"], 0.7 * top["residual"])
+    assert np.isclose(top["rest"], 0.3 * top["residual"])
 
 
 def test_all_series_are_drawn(drawing):

@@ -209,7 +209,7 @@ class Diagnosis(AbstractShown):
         )
 
     def plot_shares(self, recording: int = 0, joint: int = 1, contenders: int = 4) -> go.Figure:
-        """What each contender predicts of one joint's residual in time.
+        """What each contender explains of one joint's residual in time, the model refitted to it.
 
         **Arguments:**
 
@@ -218,10 +218,8 @@ class Diagnosis(AbstractShown):
         keep = self.data.mask[recording]
         shares = {}
         for verdict in self.ranking[:contenders]:
-            columns = list(verdict.hypothesis.columns)
-            values, _ = self.gram.amplitude(columns)
-            signature = self.data.columns(columns)[recording, keep, joint - 1]
-            shares[_label(verdict)] = signature @ values
+            rest = leftover(self.data, self.noise, verdict.hypothesis.columns)
+            shares[_label(verdict)] = (self.data.residual - rest)[recording, keep, joint - 1]
         record = self.fit.recordings[recording]
         residual = self.data.residual[recording, keep, joint - 1]
         time = record.time if len(record.time) == len(residual) else np.arange(len(residual)) * 1.0
