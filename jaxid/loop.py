@@ -297,7 +297,7 @@ class Outside(eqx.Module):
     """What comes from outside the loop at one instant; vectors are `(joints,)`.
 
     `push` is torque on the drives, `pull` on the links (the same where nothing gives way between
-    them), `noise` is added to what the sensors read.
+    them and nothing depends on the load), `noise` is added to what the sensors read.
     """
 
     push: Float[Array, " joints"]
@@ -325,6 +325,7 @@ def effect_loads(
     states: tuple[Float[Array, " _"], ...],
     links: Motion | None = None,
     *,
+    push: Float[Array, " joints"] | float = 0.0,
     curves: bool = True,
     inertia: bool = True,
 ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
@@ -336,6 +337,7 @@ def effect_loads(
 
     - `motion`: of the drives. `states`: the effects' own. `links`: their motion, where they part
       from the drives.
+    - `push`: torque on the drives from outside, which effects of the load see.
     - `curves`: False to leave out what needs an acceleration that is not known yet.
     - `inertia`: False to leave out what is proportional to acceleration.
     """
@@ -356,7 +358,7 @@ def effect_loads(
             link = link + effect.torque(seen)
         else:
             drive = drive + effect.torque(seen)
-    left = dataclasses.replace(motion, tau=motion.tau - drive)
+    left = dataclasses.replace(motion, tau=motion.tau - drive + push)
     for effect, state in own:
         if effect.loaded:
             drive = drive + effect.torque(dataclasses.replace(left, state=state))
@@ -439,7 +441,7 @@ def _accelerations(
     bias = loop.arm.bias(state.q, state.v)
     own = state.effects
     if any(effect.needs_acceleration for effect in loop.effects):
-        drive, link = effect_loads(loop, motion, own, curves=False)
+        drive, link = effect_loads(loop, motion, own, push=outside.push, curves=False)
         without = motion.tau - drive - link + outside.push + outside.pull
         motion = dataclasses.replace(motion, a=solve_positive(matrix, without - bias))
     transmissions = [
@@ -448,7 +450,7 @@ def _accelerations(
     if transmissions:
         return _through_transmissions(loop, motion, state, transmissions, outside, added)
     # What is proportional to acceleration is on the left-hand side already.
-    drive, link = effect_loads(loop, motion, own, inertia=False)
+    drive, link = effect_loads(loop, motion, own, push=outside.push, inertia=False)
     torque = motion.tau - drive - link + outside.push + outside.pull
     return solve_positive(matrix, torque - bias), {}
 
@@ -473,7 +475,7 @@ def _through_transmissions(
         apart = apart.at[j].set(there)
         rotors = rotors.at[j].set(jnp.where(there, transmission.rotor, 0.0))
     links = dataclasses.replace(motion, q=q, v=v)
-    drive, held = effect_loads(loop, motion, state.effects, links, inertia=False)
+    drive, held = effect_loads(loop, motion, state.effects, links, push=outside.push, inertia=False)
     available = motion.tau - drive + outside.push
     on_link = jnp.where(apart, passed, available)
     matrix = loop.arm.mass_matrix(q) + added - jnp.diag(rotors)

@@ -11,6 +11,7 @@ from jaxid.effects import (
     EncoderEccentricity,
     Gravity,
     JointElasticity,
+    LoadDependentFriction,
     Spring,
     Stribeck,
     TorqueOffset,
@@ -21,6 +22,7 @@ LINES = sim.MultiSine(
     (((0.5, 2.0, 0.3), (0.2, 5.0, 1.0)), ((0.6, 3.0, 2.0), (0.2, 6.0, 0.5))), rise=1.0
 )
 SHAFT = JointElasticity(joint=1, compliance=2e-3, rotor=1.0)
+WORN = LoadDependentFriction(joint=1, ratio=0.3)
 SMALL = 1e-5
 # Each at no amplitude, and with a small one.
 PAIRS = {
@@ -38,10 +40,10 @@ def record():
     return jaxid.Recording(run.time, run.q, run.tau, q_ref=run.q_ref)
 
 
-@pytest.mark.parametrize("shaft", [(), (SHAFT,)], ids=["rigid", "elastic"])
-def test_signature_is_the_derivative_of_a_simulation(record, shaft):
-    """What acts on a link acts there also behind a transmission."""
-    loop = set_substeps(jaxid.scara().add(*shaft), 8)
+@pytest.mark.parametrize("between", [(), (SHAFT,), (WORN,)], ids=["rigid", "elastic", "worn"])
+def test_signature_is_the_derivative_of_a_simulation(record, between):
+    """What acts on a link acts there also behind a transmission; what loads it, as a load."""
+    loop = set_substeps(jaxid.scara().add(*between), 8)
     batch = prepare(loop, jaxid.Recordings.of(record))
     linear = linearise(loop, batch, "tau")
     proposed = [(none, 1.0) for none, _ in PAIRS.values()]

@@ -21,8 +21,8 @@ class Linearised(eqx.Module):
     With x' = A x + B u and y = C x + D u, where u holds the free parameters, then each of `places`
     at both ends of an interval: torque on the drives (`push`), what is added to the positions
     (`noise`) and velocities (`rate`) that the sensors read, and torque on the links (`pull`) where
-    transmissions part them from the drives. Each leaf has `(recordings, points)` first. `motion` is
-    the nominal one, `seen` the signals of `SIGNALS`.
+    transmissions or friction by load part them from the drives. Each leaf has `(recordings,
+    points)` first. `motion` is the nominal one, `seen` the signals of `SIGNALS`.
     """
 
     A: Float[Array, "recordings points states states"]
@@ -46,7 +46,7 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     loop = with_rolled_stages(loop)
     n, theta, row = loop.joints, loop.theta, SIGNALS.index(output)
     p = theta.shape[0]
-    parted = any(isinstance(effect, AbstractTransmission) for effect in loop.effects)
+    parted = any(isinstance(e, AbstractTransmission) or e.loaded for e in loop.effects)
     places: tuple[Place, ...] = ("push", "noise", "rate", *(("pull",) if parted else ()))
     ends = jnp.zeros((2 * len(places), n))
 

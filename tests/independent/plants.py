@@ -23,6 +23,8 @@ class Plant(Protocol):
 
     def friction_parameters(self) -> tuple[tuple[float, float], ...]: ...
 
+    def drive_offsets(self) -> tuple[float, ...]: ...
+
     def inertia(self, q: Sequence[float]) -> list[list[float]]: ...
 
     def bias(self, q: Sequence[float], v: Sequence[float]) -> list[float]: ...
@@ -48,6 +50,10 @@ class Scara:
     def friction_parameters(self) -> tuple[tuple[float, float], ...]:
         """(Fv, Fc) of each joint, N m s and N m."""
         return (self.Fv1, self.Fc1), (self.Fv2, self.Fc2)
+
+    def drive_offsets(self) -> tuple[float, ...]:
+        """None, N m."""
+        return 0.0, 0.0
 
     def inertia(self, q: Sequence[float]) -> list[list[float]]:
         """Mass matrix, kg m2."""
@@ -100,6 +106,10 @@ class TwoLink:
         """(Fv, Fc) of each joint, N m s and N m."""
         return (self.Fv1, self.Fc1), (self.Fv2, self.Fc2)
 
+    def drive_offsets(self) -> tuple[float, ...]:
+        """None, N m."""
+        return 0.0, 0.0
+
     def inertia(self, q: Sequence[float]) -> list[list[float]]:
         """Mass matrix, kg m2."""
         h = self.p3 * math.cos(q[1])
@@ -151,13 +161,17 @@ class Axis:
         """(Fv, Fc) of the axis, N/(m/s) and N."""
         return ((self.Fv, self.Fc),)
 
+    def drive_offsets(self) -> tuple[float, ...]:
+        """What the drive spends on itself (its amplifier's offset), N: no load of its table."""
+        return (self.offset,)
+
     def inertia(self, q: Sequence[float]) -> list[list[float]]:
         """Mass, kg."""
         return [[self.M]]
 
     def bias(self, q: Sequence[float], v: Sequence[float]) -> list[float]:
-        """Constant force, N."""
-        return [self.offset]
+        """None, N."""
+        return [0.0]
 
     def energy(self, q: Sequence[float], v: Sequence[float]) -> float:
         """Kinetic energy, J."""
@@ -185,6 +199,7 @@ def inverse_dynamics(
         + b[j]
         + fv * v[j]
         + fc * sigma(v[j], plant.gamma)
+        + plant.drive_offsets()[j]
         for j, (fv, fc) in enumerate(plant.friction_parameters())
     ]
 

@@ -65,6 +65,7 @@ class Loop:
 
         joints = range(n)
         self.base = plant.friction_parameters()
+        self.offsets = plant.drive_offsets()
         self.motor = [[e.needed for e in at("motor", j)] for j in joints]
         self.link = [[e.needed for e in at("link", j)] for j in joints]
         self.drift: list[list[ThermalDrift]] = [at("base_friction", j) for j in joints]
@@ -172,6 +173,7 @@ class Loop:
             friction = fv * w + fc * TWO_OVER_PI * math.atan(plant.gamma * w)
             for d in self.drift[j]:
                 friction *= d.factor(t)
+            friction += self.offsets[j]
             for f in self.motor[j]:
                 friction += f(t, p, w)
             for i, b in self.bristles[j]:
