@@ -278,6 +278,14 @@ class Bounds(eqx.Module):
             low & high, both, jnp.where(low, one_sided, jnp.where(high, from_above, free))
         )
 
+    def moved_inside(self, values: Vector) -> Vector:
+        """The values, those on a bound or beyond it moved just inside.
+
+        Those that are inside stay, however near: a small robot's values are all near zero.
+        """
+        within = (values > self.lower) & (values < self.upper)
+        return jnp.where(within, values, self.inside(self.outside(values)))
+
 
 # Rounding of the corner at a bound, in units of the parameter's scale.
 _CORNER = 1e-3

@@ -252,6 +252,18 @@ def test_what_is_on_a_bound_or_beyond_is_moved_just_inside(kind):
             assert abs(back - end) < 2e-3 * SCALE
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_only_what_is_not_inside_is_moved_inside(kind):
+    """The compliance of a heavy machine in m/N is a millionth of its scale."""
+    bounds, (lower, upper) = bounds_of(kind), KINDS[kind]
+    near = 1e-6 * SCALE
+    inside = (lower if math.isfinite(lower) else -1.0) + near
+    ends = [end for end in (lower, upper) if math.isfinite(end)]
+    moved = np.asarray(bounds.moved_inside(jnp.array([inside, *ends])))
+    assert moved[0] == inside
+    assert np.all((moved > lower) & (moved < upper))
+
+
 @pytest.mark.parametrize("kind", ["free", "from below", "from above"])
 def test_next_to_the_identity_away_from_a_bound(kind):
     bounds, (lower, upper) = bounds_of(kind), KINDS[kind]

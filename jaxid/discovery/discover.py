@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -646,13 +645,12 @@ def _released(loop: ClosedLoop, names: Sequence[str]) -> list[ClosedLoop]:
 
 
 def _inside(effect: AbstractEffect) -> AbstractEffect:
-    """The effect with its parameters moved just inside their bounds."""
+    """The effect with parameters that are on their bounds or beyond moved just inside."""
     chosen = [p for p in list_parameters(effect) if p.declaration.free]
     if not chosen:
         return effect
-    bounds = Bounds.of(chosen)
-    values = bounds.inside(bounds.outside(read_values(effect, chosen)))
-    return write_values(effect, chosen, jnp.asarray(values))
+    values = Bounds.of(chosen).moved_inside(read_values(effect, chosen))
+    return write_values(effect, chosen, values)
 
 
 def _curve_is_better(diagnosis: Diagnosis, gained: float) -> bool:

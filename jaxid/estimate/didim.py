@@ -34,11 +34,7 @@ def _moved(
     loop: ClosedLoop, theta: Float[Array, " parameters"]
 ) -> tuple[ClosedLoop, Float[Array, ""]]:
     chosen = linear_parameters(loop)
-    bounds = Bounds.of(chosen)
-    within = (theta > bounds.lower) & (theta < bounds.upper)
-    # Those that are inside stay, however near: a small robot's values are all near zero.
-    values = jnp.where(within, theta, bounds.inside(bounds.outside(theta)))
-    moved = write_values(loop, chosen, values)
+    moved = write_values(loop, chosen, Bounds.of(chosen).moved_inside(theta))
     return moved, moved.arm.smallest_inertia()
 
 
