@@ -5,6 +5,7 @@ Where two batches are in flight on two cores both threads wait, nobody works, an
 stands still for good. A matrix by itself is done where it is asked for.
 """
 
+import jax
 import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Float
@@ -16,6 +17,12 @@ def solve(
 ) -> Float[Array, "size *columns"]:
     """The solution of matrix @ x = right."""
     return jnp.linalg.solve(matrix, right)
+
+
+@sequential_vmap
+def exponential(matrix: Float[Array, "size size"]) -> Float[Array, "size size"]:
+    """The matrix exponential, whose approximation by fractions is solved for."""
+    return jax.scipy.linalg.expm(matrix)
 
 
 @sequential_vmap

@@ -67,6 +67,13 @@ class ClosedLoop(eqx.Module):
                     f"{effect.effect_name()} is on joint {joint}, but {self.name} has joints 1 to "
                     f"{self.joints}: joints count from 1"
                 )
+        joints = [e.joint for e in self.effects if isinstance(e, AbstractTransmission)]
+        for joint in joints:
+            if joints.count(joint) > 1:
+                raise ModelError(
+                    f"{self.name} has two transmissions on joint {joint}: keep the one that gives "
+                    "way between its drive and its link"
+                )
 
     @property
     def joints(self) -> int:
@@ -156,6 +163,26 @@ class ClosedLoop(eqx.Module):
         """The same loop with more effects."""
         return dataclasses.replace(self, effects=(*self.effects, *effects))
 
+    def with_effects(self, effects: Iterable[AbstractEffect]) -> "ClosedLoop":
+        """The same loop with these effects; what is held or freed stays so with its effect.
+
+        A parameter's name may change as another of its kind comes or goes.
+        """
+        loop = dataclasses.replace(self, effects=tuple(effects))
+        places = {id(effect): k for k, effect in enumerate(loop.effects)}
+        names = {p.where.steps: p.name for p in loop.parameters}  # type: ignore[attr-defined]
+        moved = {}
+        for p in self.parameters:
+            first, *steps = p.where.steps  # type: ignore[attr-defined]
+            if first == "effects":
+                steps[0] = places.get(id(self.effects[steps[0]]))
+            moved[p.name] = names.get((first, *steps))
+        return dataclasses.replace(
+            loop,
+            held=frozenset(moved.get(name) for name in self.held) - {None},
+            freed=frozenset(moved.get(name) for name in self.freed) - {None},
+        )
+
     def without(self, name: str, joint: int | None = None) -> "ClosedLoop":
         """The same loop without the effects of a name, on one joint or on all.
 
@@ -178,7 +205,7 @@ class ClosedLoop(eqx.Module):
             raise ModelError(
                 f"there is no effect {name!r}{where} to take away: the loop has {', '.join(there)}"
             )
-        return dataclasses.replace(self, effects=kept)
+        return self.with_effects(kept)
 
     def _repr_html_(self) -> str:
         rows = "".join(
@@ -331,7 +358,8 @@ def effect_loads(
 ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
     """Torque that all effects together ask of the drives, and that of the links, `(joints,)` each.
 
-    Effects of the load come last, since they are given what the others leave of the torque.
+    Effects of the load come last, since they are given what the others leave of the torque; what
+    is proportional to acceleration, which is solved for, is not taken off it.
 
     **Arguments:**
 
@@ -341,7 +369,7 @@ def effect_loads(
     - `curves`: False to leave out what needs an acceleration that is not known yet.
     - `inertia`: False to leave out what is proportional to acceleration.
     """
-    drive = link = jnp.zeros_like(motion.v)
+    drive = link = ahead = jnp.zeros_like(motion.v)
     behind = motion if links is None else links
     own = [
         (effect, state)
@@ -354,11 +382,15 @@ def effect_loads(
         seen = dataclasses.replace(behind if effect.on_link else motion, state=state)
         if effect.inertial and not inertia:
             seen = dataclasses.replace(seen, a=jnp.zeros_like(seen.a))
+        torque = effect.torque(seen)
         if effect.on_link:
-            link = link + effect.torque(seen)
-        else:
-            drive = drive + effect.torque(seen)
-    left = dataclasses.replace(motion, tau=motion.tau - drive + push)
+            link = link + torque
+            continue
+        drive = drive + torque
+        if effect.inertial:
+            torque = effect.torque(dataclasses.replace(seen, a=jnp.zeros_like(seen.a)))
+        ahead = ahead + torque
+    left = dataclasses.replace(motion, tau=motion.tau - ahead + push)
     for effect, state in own:
         if effect.loaded:
             drive = drive + effect.torque(dataclasses.replace(left, state=state))

@@ -186,7 +186,7 @@ def write_values(model: Any, parameters: Sequence[Parameter], values: Vector) ->
     pieces, start = [], 0
     for p in parameters:
         piece = values[start : start + p.size]
-        pieces.append(piece if p.several else piece[0])
+        pieces.append(piece.reshape(jnp.shape(p.where(model))))
         start += p.size
     return eqx.tree_at(lambda tree: [p.where(tree) for p in parameters], model, pieces)
 

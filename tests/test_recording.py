@@ -205,7 +205,7 @@ def test_units_by_joint_and_for_one_signal_alone() -> None:
     np.testing.assert_array_equal(recording.q_ref, signals()["q_ref"])
 
 
-def test_columns_may_be_products_and_whole_arrays(tmp_path: Path) -> None:
+def test_columns_may_be_products_numbers_and_whole_arrays(tmp_path: Path) -> None:
     given = signals()
     np.savez(
         tmp_path / "fit.npz",
@@ -219,6 +219,22 @@ def test_columns_may_be_products_and_whole_arrays(tmp_path: Path) -> None:
     recording = read(tmp_path / "fit.npz", columns=columns)[0]
     np.testing.assert_array_equal(recording.q, given["q"])
     np.testing.assert_array_equal(recording.tau, 2 * given["tau"])
+    numbers = {"time": "t", "q": "pos", "tau": ["2*i1", "i2 * -0.5 * 2"]}
+    recording = read(tmp_path / "fit.npz", columns=numbers)[0]
+    np.testing.assert_array_equal(recording.tau, [2, -1] * given["tau"])
+
+
+@pytest.mark.parametrize("name", ["q", "q_ref", "tau"])
+def test_names_without_an_underscore(name: str) -> None:
+    table = frame().rename(columns={f"{name}_{j}": f"{name}{j}" for j in (1, 2)})
+    same(Recording.from_dataframe(table), Recording.from_arrays(**signals()))
+    with pytest.raises(RecordingError, match=f"'{name}1' is missing though '{name}2' is there"):
+        Recording.from_dataframe(table.drop(columns=f"{name}1"))
+
+
+def test_a_plain_v1_is_no_velocity() -> None:
+    table = frame().rename(columns={"v_1": "v1", "v_2": "v2"})
+    assert Recording.from_dataframe(table).v is None
 
 
 def test_uneven_sampling_is_no_gap() -> None:
@@ -309,7 +325,7 @@ COMPLAINTS = {
     "no extension": ("a", b"PK", "extension '' is not known"),
     "gz of mat": ("a.mat.gz", b"PK", "extension '.gz' is not known"),
     "missing": ("a.csv", without("tau_2"), r"'tau_2' is missing though 'q_2' is there, there are"),
-    "no time": ("a.csv", without("time"), r"'time' is missing.*pass columns=\{'time'"),
+    "no time": ("a.csv", without("time"), r"'time' is missing.*say which.*columns=\{'time'"),
     "no q": ("a.csv", without("q_1", "q_2"), "'q_1' is missing"),
     "q_2 alone": ("a.csv", without("q_1"), "'q_1' is missing though 'q_2' is there"),
     "misnamed": ("a.csv", renamed(q_2="q2"), r"'q_2' is missing.*did you mean 'q2'"),
@@ -412,7 +428,8 @@ def test_a_bare_array_in_npz_is_refused(tmp_path: Path) -> None:
         ({"columns": {"q": ["q_1", "pos2"]}}, "'pos2' is missing"),
         ({"columns": {"q": ["q_1"]}}, "q has 1 joints and q_ref has 2"),
         ({"columns": {"tau": []}}, "no column for tau"),
-        ({"columns": {"tau": ["q_1*", "q_2"]}}, "column '' is missing"),
+        ({"columns": {"tau": ["q_1*", "q_2"]}}, r"column '' is missing.*--column tau="),
+        ({"columns": {"tau": ["2*i_1", "q_2"]}}, r"column 'i_1' is missing.*--column tau="),
         ({"resolution": [1.0, -1.0]}, "resolution is"),
         ({"resolution": [1.0, 1.0, 1.0]}, "resolution is"),
         ({"resolution": math.nan}, "resolution is"),

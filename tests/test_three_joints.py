@@ -42,13 +42,6 @@ class ThreeLink(AbstractArm):
         turning = jax.jvp(lambda at: self.mass_matrix(at) @ v, (q,), (v,))[1]
         return turning - jax.grad(lambda at: 0.5 * v @ self.mass_matrix(at) @ v)(q)
 
-    def regressor(self, q, v, a):
-        def torque(m):
-            arm = ThreeLink(m1=m[0], m2=m[1], m3=m[2])
-            return arm.mass_matrix(q) @ a + arm.bias(q, v)
-
-        return jax.jacfwd(torque)(jnp.ones(3))
-
 
 def chain() -> mujoco.MjModel:
     body = ""

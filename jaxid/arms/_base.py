@@ -45,11 +45,22 @@ class AbstractArm(eqx.Module):
     ) -> Float[Array, " joints"]:
         """Coriolis, centrifugal and gravity torque, `(joints,)`, N·m or N."""
 
-    @abc.abstractmethod
     def regressor(
         self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
     ) -> Float[Array, "joints parameters"]:
-        """Derivative of the torque by the base parameters, in the order of the fields."""
+        """Derivative of the torque by the base parameters, in the order of the fields.
+
+        **Arguments:**
+
+        - `q`, `v`, `a`: position, velocity and acceleration, `(joints,)`, rad or m and per s.
+        """
+        parameters = list_parameters(self)
+
+        def torque(values):
+            arm = write_values(self, parameters, values)
+            return arm.mass_matrix(q) @ a + arm.bias(q, v)
+
+        return jax.jacfwd(torque)(read_values(self, parameters))
 
     def split(self, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Split:
         """The regressor in parts that need no acceleration.

@@ -8,7 +8,7 @@ from ._base import AbstractController, Reading, Reference
 
 
 class Cascade(AbstractController):
-    """vir = kp kv (q_ref - q) - kv dq in volts, sampled, saturated; force = gtau · vir.
+    """vir = kp kv (q_ref - q) - kv dq in volts, sampled, saturated; force = gtau · vir. One joint.
 
     `dq` is the backward difference of the position averaged over the last two samples (Janot,
     Gautier, Brunot 2019). A known torque (`tau_ff`) is added before the saturation.

@@ -12,11 +12,15 @@ def _vector(value: object) -> Float[Array, " joints"]:
 
 
 class PD(AbstractController):
-    """tau = Kg (Kp (q_ref - q) - Kv v), equation (12) of Brunot et al. 2016.
+    """tau = Kg (Kp (q_ref - q) - Kv v) + tau_ff, equation (12) of Brunot et al. 2016.
+
+    It damps the measured velocity, not its error; `tau_ff` is the recordings' feed-forward.
 
     **Arguments:**
 
-    - `Kp`, `Kv`, `Kg`: gains, `(joints,)`, 1/s², 1/s and kg·m² (or kg).
+    - `Kp`, `Kv`: gains, `(joints,)`, N·m/rad and N·m·s/rad (N/m and N·s/m where a joint slides);
+      1/s² and 1/s where `Kg` is given.
+    - `Kg`: `(joints,)`, kg·m² (or kg); 1 by default.
     """
 
     Kp: Float[Array, " joints"] = eqx.field(converter=_vector)

@@ -217,7 +217,7 @@ def _simulate_in_windows(
 ) -> tuple[Simulated, ...]:
     if window is None:
         loop = with_substeps(loop, recordings)
-        batch = from_best_starts(method, loop, recordings, prepare(loop, recordings))
+        batch = from_best_starts(method, loop, tuple(recordings), prepare(loop, recordings))
         return by_recording(simulate_batch(loop, batch), recordings)
     runs = []
     for recording in recordings:

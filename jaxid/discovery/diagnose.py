@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -15,11 +16,11 @@ import plotly.graph_objects as go
 from jaxtyping import Float
 
 from .. import figures
-from ..effects import AbstractEffect, Curve, Motion, Scene
+from ..effects import AbstractEffect, AbstractTransmission, Curve, Motion, Scene
 from ..effects import catalogue as known
 from ..errors import FitError, ModelError
 from ..estimate import Fit
-from ..estimate.oem import _free_starts, _signals, oem_of, pieces_of
+from ..estimate.oem import _free_starts, _signals, from_best_starts, oem_of, pieces_of
 from ..loop import ClosedLoop
 from ..noise import ARFilter
 from ..parameters import write_values
@@ -101,7 +102,7 @@ class Diagnosis(AbstractShown):
     @property
     def adequate(self) -> bool:
         """Whether nothing significant is left, neither for the catalogue nor for a curve."""
-        return all(v.p_value > self.significance for v in (*self.ranking[:1], *self.where[:1]))
+        return all(v.p_value > self.significance for v in (*self.ranking, *self.where))
 
     def light(self) -> "Diagnosis":
         """The same with the signatures of the ranking alone: all of them are large."""
@@ -213,16 +214,17 @@ class Diagnosis(AbstractShown):
 
         **Arguments:**
 
-        - `recording`: number from 0. `joint`: counted from 1. `contenders`: how many.
+        - `recording`: number from 0; of the piece, where the fit was in windows.
+        - `joint`: counted from 1. `contenders`: how many.
         """
         keep = self.data.mask[recording]
         shares = {}
         for verdict in self.ranking[:contenders]:
             rest = leftover(self.data, self.noise, verdict.hypothesis.columns)
             shares[_label(verdict)] = (self.data.residual - rest)[recording, keep, joint - 1]
-        record = self.fit.recordings[recording]
+        record = pieces_of(self.fit.recordings, oem_of(self.fit).window)[recording]
         residual = self.data.residual[recording, keep, joint - 1]
-        time = record.time if len(record.time) == len(residual) else np.arange(len(residual)) * 1.0
+        time = record.time[keep[: record.samples]]
         unit = self.fit.loop.arm.units()[0][joint - 1]
         return figures.shares_in_time(time, residual, shares, unit=unit)
 
@@ -265,13 +267,8 @@ class Diagnosis(AbstractShown):
         return save(self, path)
 
     def _kept(self, rows: Float[np.ndarray, "recordings points"]) -> Float[np.ndarray, " samples"]:
-        """The samples of all recordings, one after the other, of rows that may be finer."""
-        mask = self.data.mask
-        ends = np.linspace(0, 1, mask.shape[1])
-        if rows.shape[1] != mask.shape[1]:
-            own = np.linspace(0, 1, rows.shape[1])
-            rows = np.stack([np.interp(ends, own, row) for row in rows])
-        return rows[mask]
+        """The samples of all recordings, one after the other."""
+        return rows[self.data.mask]
 
     def to_dict(self) -> dict[str, Any]:
         """The ranking and where the model fails, as plain JSON."""
@@ -390,19 +387,22 @@ def diagnose(
         tones, trials = _tones(residual, np.asarray(batch.kept), fit.recordings)
         scene = survey(loop, fit.recordings, linear.motion, tones)
         proposed = candidates(catalogue, scene, trials)
+        parted = {e.joint for e in loop.effects if isinstance(e, AbstractTransmission)}
+        proposed = [
+            (effect, tests)
+            for effect, tests in proposed
+            if not (isinstance(effect, AbstractTransmission) and effect.joint in parted)
+        ]
         proposed += [(curve, 1.0) for curve in curves(scene, linear.motion)]
         row = {"tau": 0, "q": 1}[output]
         hypotheses, table = signatures(loop, batch, linear, proposed, row, say)
-        if not np.isfinite(table).all():
-            raise FitError(
-                f"{loop.name} runs away once it is linearised along these recordings: take smaller "
-                "steps, jaxid.Stepping(substeps=...)"
-            )
+        _check_finite(loop, hypotheses, table)
         table = _at_samples(batch, table)
         data = Data(residual, base, table, np.asarray(batch.kept))
         say(f"scoring {len(hypotheses)} hypotheses")
         try:
-            return _judge(fit, data, hypotheses, scene, linear.motion, significance)
+            motion = _sampled(batch, linear.motion)
+            return _judge(fit, data, hypotheses, scene, motion, significance)
         except np.linalg.LinAlgError as error:
             raise FitError(
                 f"what is left of these recordings by {loop.name} is too large to be held against "
@@ -410,12 +410,46 @@ def diagnose(
             ) from error
 
 
+def _check_finite(
+    loop: ClosedLoop, hypotheses: Sequence[Hypothesis], table: Float[np.ndarray, "..."]
+) -> None:
+    """Raises `FitError` where a signature is not finite."""
+    there = np.isfinite(table).all(axis=(0, 1, 2))
+    bad = [h for h in hypotheses if not there[list(h.columns)].all()]
+    if len(bad) > len(hypotheses) / 2:
+        raise FitError(
+            f"{loop.name} runs away once it is linearised along these recordings: take smaller "
+            "steps, jaxid.Stepping(substeps=...)"
+        )
+    if bad:
+        first = bad[0]
+        raise FitError(
+            f"the signature of {first.name} on joint {first.joint or 'all'} is not finite along "
+            "these recordings: mend its torque, or leave it out of the catalogue"
+        )
+
+
 def _as_fitted(fit: Fit | Comparison, loop: ClosedLoop) -> tuple[str, Batch, np.ndarray]:
     """Which output is compared, the batch, and which initial states are free, as in the fit."""
     method = oem_of(fit)
     pieces = pieces_of(fit.recordings, method.window)
     batch = prepare(loop, pieces)
-    return _signals(method, loop)[0], batch, _free_starts(method, pieces, batch)
+    free = _free_starts(method, pieces, batch)
+    if free.any():
+        start, n = getattr(getattr(fit, "optimum", None), "start", None), loop.joints
+        if start is not None and len(start) == len(pieces):
+            batch = dataclasses.replace(batch, q0=start[:, :n], v0=start[:, n:])
+        else:
+            batch = from_best_starts(method, loop, pieces, batch)
+    return _signals(method, loop)[0], batch, free
+
+
+def _sampled(batch: Batch, motion: Motion) -> Motion:
+    """A motion at the samples alone, where the grid has points between them."""
+    if batch.at is None:
+        return motion
+    rows = np.arange(len(batch.at))[:, None], np.asarray(batch.at)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[rows], motion)
 
 
 def _at_samples(batch: Batch, x: Float[np.ndarray, "recordings points *axes"]) -> np.ndarray:

@@ -61,6 +61,11 @@ def discover(
     another call.
     """
     started = time.perf_counter()
+    if method is not None and method.output is not None:
+        raise FitError(
+            f"a discovery compares what the loop is judged by, not OEM(output={method.output!r}): "
+            "leave out output"
+        )
     recordings = Recordings.of(recordings)
     held_out = None if validate is None else Recordings.of(validate)
     Recordings.of([*recordings, *(held_out or ())]).common_period()
@@ -482,7 +487,9 @@ class _Search(eqx.Module):
         if len(added) < 2:
             return []
         for at, k in enumerate(added):
-            for rival in (None, *(() if steps[k] is final else _rivals(steps[k]))):
+            rivals = () if steps[k] is final else _rivals(steps[k])
+            fitting = (r for r in rivals if not _doubled(final.fit.loop, len(added) - at, r))
+            for rival in (None, *fitting):
                 refitted = self.replaced(final, len(added) - at, rival, say)
                 value = self.criterion(refitted, final.diagnosis)
                 found.append((value, k, rival, refitted))
@@ -517,8 +524,7 @@ class _Search(eqx.Module):
             f"again without {effect_on(gone.effect_name(), getattr(gone, 'joint', None))}"
             f"{with_what}"
         )
-        effects = (*loop.effects[:at], *instead, *loop.effects[at + 1 :])
-        less = dataclasses.replace(loop, effects=effects)
+        less = loop.with_effects((*loop.effects[:at], *instead, *loop.effects[at + 1 :]))
         return fit(less, self.recordings, self.whitened_method(final.diagnosis))
 
 
@@ -625,6 +631,15 @@ def _rivals(step: Step, most: int = 2) -> list[Contender]:
     ][:most]
 
 
+def _doubled(loop: ClosedLoop, from_end: int, rival: Contender) -> bool:
+    """Whether a rival, in place of an effect, would be a joint's second transmission."""
+    effect, at = rival.fit.loop.effects[-1], len(loop.effects) - from_end
+    rest = (*loop.effects[:at], *loop.effects[at + 1 :])
+    return isinstance(effect, AbstractTransmission) and any(
+        isinstance(e, AbstractTransmission) and e.joint == effect.joint for e in rest
+    )
+
+
 def _held_shapes(loop: ClosedLoop) -> tuple[str, ...]:
     """Names of the last effect's parameters that no fit estimates unless told to."""
     last = ("effects", len(loop.effects) - 1)
@@ -639,7 +654,7 @@ def _released(loop: ClosedLoop, names: Sequence[str]) -> list[ClosedLoop]:
     """The loop with these values free: from where they are, and from half and twice each."""
     if not names:
         return []
-    given = {p.name: float(np.asarray(p.where(loop))) for p in loop.parameters if p.name in names}
+    given = {p.name: np.asarray(p.where(loop)) for p in loop.parameters if p.name in names}
     changes = [{}, *({name: f * given[name]} for name in names for f in (0.5, 2.0))]
     return [loop.with_values(**change).free(*names) for change in changes]
 

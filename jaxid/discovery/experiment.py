@@ -22,6 +22,7 @@ from .diagnose import Diagnosis, Verdict, _at_samples
 from .linear import base_columns, linearise
 from .score import Data, Gram
 from .signatures import signatures
+from .story import effect_on
 
 
 class Experiment(AbstractShown):
@@ -103,9 +104,14 @@ def next_experiment(
         )
     chosen = list(effects) if effects is not None else _group(diagnosis)
     # A transmission's signature is a simulation of its own, too slow to repeat for each reference.
-    chosen = [v for v in chosen if not isinstance(v.hypothesis.effect, AbstractTransmission)]
-    if not chosen:
-        raise FitError("there is no effect whose signature can be predicted on another reference")
+    asked, parted = chosen, [isinstance(v.hypothesis.effect, AbstractTransmission) for v in chosen]
+    chosen = [v for v, apart in zip(asked, parted, strict=True) if not apart]
+    if any(parted) and len(chosen) < min(len(asked), 2):
+        first = asked[parted.index(True)]
+        raise FitError(
+            f"the signature of {effect_on(*first.key)} is a simulation of its own, too slow to "
+            "repeat for each reference: give two effects that are no transmissions"
+        )
     bounds = Limits.of(diagnosis.fit.recordings) if limits is None else limits
     loop = with_substeps(diagnosis.fit.loop, diagnosis.fit.recordings)
     period = float(np.median([r.period for r in diagnosis.fit.recordings]))
@@ -119,7 +125,7 @@ def next_experiment(
             "limits.torque, or lower limits.speed"
         )
     best = int(np.nanargmax(np.where(np.isfinite(scores), scores, np.nan)))
-    names = tuple(v.hypothesis.name for v in chosen)
+    names = tuple(effect_on(*v.key) for v in chosen)
     columns = [list(v.hypothesis.columns) for v in chosen]
     now = _apart(diagnosis.gram, columns, [diagnosis.gram.amplitude(c)[0] for c in columns])
     return Experiment(runs[best], names, now, float(scores[best]), loop.arm.units())
@@ -174,7 +180,10 @@ def _separations(
     hypotheses, table = signatures(loop, batch, linear, proposed, 0, lambda text: None)
     base = _at_samples(batch, np.asarray(base_columns(linear, loop.theta.shape[0], False)))
     rows = _at_samples(batch, table)
-    seen = _at_samples(batch, np.asarray(linear.seen))
+    seen = np.asarray(linear.seen)
+    if batch.at is not None:
+        seen = np.stack([row[at] for row, at in zip(seen, np.asarray(batch.at), strict=True)])
+    kept = np.asarray(batch.kept)
     columns = [list(h.columns) for h in hypotheses]
     sizes = [diagnosis.gram.amplitude(v.hypothesis.columns)[0] for v in chosen]
     scores, runs = np.full(len(drawn), np.nan), []
@@ -183,9 +192,7 @@ def _separations(
         runs.append(Recording(recording.time, q, tau, q_ref=recording.q_ref, name=recording.name))
         if not np.isfinite(seen[k]).all() or np.any(np.abs(tau) > 1.05 * limits.torque):
             continue
-        data = Data(
-            np.zeros_like(tau)[None], base[k : k + 1], rows[k : k + 1], np.ones((1, len(tau)), bool)
-        )
+        data = Data(np.zeros_like(tau)[None], base[k : k + 1], rows[k : k + 1], kept[k : k + 1])
         scores[k] = _apart(Gram.of(data, diagnosis.noise), columns, sizes)
     return scores, runs
 

@@ -10,9 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..effects import AbstractEffect, Coulomb, Curve, Motion, Scene
+from ..effects import AbstractEffect, Coulomb, Curve, Motion, Scene, check_declared
+from ..effects import catalogue as known
 from ..effects.curve import curve_over
 from ..errors import ModelError
+from ..lapack import exponential
 from ..loop import ClosedLoop, effect_loads
 from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..recording import Recordings
@@ -46,7 +48,9 @@ class Hypothesis(eqx.Module):
 
 
 def amplitudes(effect: AbstractEffect) -> tuple[Parameter, ...]:
-    """The parameters in which the effect is linear."""
+    """The parameters in which the effect is linear; none where it is screened by simulations."""
+    if effect.finite:
+        return ()
     return tuple(p for p in list_parameters(effect) if p.declaration.free and p.declaration.linear)
 
 
@@ -61,12 +65,15 @@ def survey(
 ) -> Scene:
     """What screening knows of the recordings and the nominal motion."""
     q = np.asarray(motion.q).reshape(-1, loop.joints)
+    low, high = q.min(axis=0), q.max(axis=0)
+    speed = np.abs(np.asarray(motion.v)).reshape(-1, loop.joints).max(axis=0)
     mass = np.asarray(jax.vmap(loop.arm.mass_matrix)(jnp.asarray(q[:: max(1, len(q) // 64)])))
     sharp = {e.joint: float(e.gamma) for e in loop.effects if isinstance(e, Coulomb)}
     return Scene(
-        q.min(axis=0),
-        q.max(axis=0),
-        np.abs(np.asarray(motion.v)).reshape(-1, loop.joints).max(axis=0),
+        low,
+        # A joint that is held still has a travel all the same, which shapes can be a part of.
+        np.maximum(high, low + 1e-6),
+        np.maximum(speed, 1e-6),
         np.abs(np.asarray(motion.tau)).reshape(-1, loop.joints).max(axis=0),
         1 / np.mean(np.diagonal(np.linalg.inv(mass), axis1=1, axis2=2), axis=0),
         np.array([sharp.get(j, 100.0) for j in range(1, loop.joints + 1)]),
@@ -133,6 +140,8 @@ def candidates(
                 f"{entry!r} cannot be screened: a catalogue holds effect classes, effects, or "
                 "functions from a scene to effects"
             )
+    for one in {type(e): e for e in made if type(e) not in known}.values():
+        check_declared(one, len(scene.slides))
     picked = max(1, sum(len(row) for row in scene.tones))
     return [
         (e, trials / picked if e.effect_name() == "periodic_disturbance" else 1.0) for e in made
@@ -146,28 +155,46 @@ def _settled_states(effect: AbstractEffect, motion: Motion) -> Float[Array, "poi
     """The effect's own states along a motion, by an exponential step for each interval.
 
     States relax with rates that friction and lags make stiff; the step is exact where the rate is
-    linear in its state and the motion a line.
+    linear in its state and goes as a line from sample to sample.
     """
-    start = effect.initial_state()
+    first = jax.tree.map(lambda leaf: leaf[0], motion)
+    start = effect.settled(eqx.tree_at(lambda m: m.state, first, effect.initial_state()))
     if start.shape[0] == 0:
         return jnp.zeros((motion.t.shape[0], 0))
 
     def body(x, pair):
         now, then = pair
-        h = then.t - now.t
         middle = jax.tree.map(lambda a, b: 0.5 * (a + b), now, then)
         middle = dataclasses.replace(middle, label=now.label)
 
-        def rate(state):
-            return effect.derivative(eqx.tree_at(lambda m: m.state, middle, state))
+        def rate(state, at):
+            return effect.derivative(eqx.tree_at(lambda m: m.state, at, state))
 
-        slope = h * jnp.diagonal(jax.jacfwd(rate)(x))
-        small = jnp.abs(slope) < 1e-6
-        gain = jnp.where(small, 1.0, jnp.expm1(slope) / jnp.where(small, 1.0, slope))
-        return x + h * gain * rate(x), x
+        h = then.t - now.t
+        slope, begin, end = jax.jacfwd(rate)(x, middle), rate(x, now), rate(x, then)
+        return x + _relaxed(h * slope, h * begin, h * (end - begin)), x
 
     following = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), motion)
     return jax.lax.scan(body, start, (motion, following))[1]
+
+
+def _relaxed(
+    slope: Float[Array, "states states"],
+    rate: Float[Array, " states"],
+    change: Float[Array, " states"],
+) -> Float[Array, " states"]:
+    """How far x goes in unit time, with x' = slope (x - x0) + rate + t change."""
+    n = rate.shape[0]
+    if n == 1:
+        s = slope[0, 0]
+        small = jnp.abs(s) < 1e-4
+        safe = jnp.where(small, 1.0, s)
+        first = jnp.where(small, 1 + s / 2, jnp.expm1(safe) / safe)
+        second = jnp.where(small, 0.5 + s / 6, (first - 1) / safe)
+        return first * rate + second * change
+    # Van Loan 1978: the integrals stand beside the exponential of a larger matrix.
+    matrix = jnp.zeros((n + 2, n + 2)).at[:n, :n].set(slope).at[n + 1, n].set(1.0)
+    return exponential(matrix.at[:n, n].set(rate).at[:n, n + 1].set(change))[:n, n]
 
 
 Forces = tuple[
@@ -187,10 +214,11 @@ AllForces = tuple[
 def _forces(effect: AbstractEffect, motion: Motion, left: Float[Array, "points joints"]) -> Forces:
     """What the effect adds to joint torque, position read and velocity read, by amplitude."""
     linear = amplitudes(effect)
-    states = _settled_states(effect, motion)
 
     def along(values: Float[Array, " columns"]):
         here = write_values(effect, linear, values) if linear else effect
+        # Here, since an amplitude may stand in the rate of a state.
+        states = _settled_states(here, motion)
 
         def one(at: Motion, state, rest):
             at = eqx.tree_at(lambda m: m.state, at, state)
@@ -209,11 +237,14 @@ def _forces(effect: AbstractEffect, motion: Motion, left: Float[Array, "points j
 def _left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings points joints"]:
     """Torque that the loop's own effects on the drives leave for the links along the runs."""
 
-    def remaining(at: Motion):
-        states = tuple(effect.initial_state() for effect in loop.effects)
+    def remaining(at: Motion, states: tuple[Float[Array, " _"], ...]):
         return at.tau - effect_loads(loop, at, states)[0]
 
-    return jax.vmap(jax.vmap(remaining))(motion)
+    def along(run: Motion):
+        states = tuple(_settled_states(effect, run) for effect in loop.effects)
+        return jax.vmap(remaining)(run, states)
+
+    return jax.vmap(along)(motion)
 
 
 @eqx.filter_jit
@@ -231,9 +262,13 @@ def _all_forces(
     def of_run(run: Motion, left) -> AllForces:
         pushes, noises, rates = [], [], []
         for stacked in groups:
-            forces = eqx.filter_vmap(
-                lambda effect: _forces(effect, run, left), in_axes=eqx.if_array(0)
-            )(stacked)
+            if jax.tree.leaves(stacked):
+                own = eqx.filter_vmap(
+                    lambda effect: _forces(effect, run, left), in_axes=eqx.if_array(0)
+                )
+                forces = own(stacked)
+            else:  # a law without any number of its own
+                forces = jax.tree.map(lambda x: x[None], _forces(stacked, run, left))
             push, noise, rate = (_by_point(x.astype(jnp.float32)) for x in forces)
             pushes.append(push)
             if _misreads(stacked):

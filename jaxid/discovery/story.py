@@ -86,6 +86,8 @@ class Discovery(AbstractShown):
     def sentence(self) -> str:
         """The verdict in a sentence for a colleague."""
         added = _spoken(self.steps)
+        if self.unfinished and not added:
+            return f"The model of {self.loop.name} lacks something, and was to be left as it is."
         if self.verdict == "adequate":
             return (
                 f"The model of {self.loop.name} describes these recordings down to their noise: "
@@ -182,6 +184,7 @@ class Discovery(AbstractShown):
         return {
             "robot": self.loop.name,
             "verdict": self.verdict,
+            "unfinished": self.unfinished,
             "ranking": first.diagnosis.to_dict()["ranking"],
             "added": [
                 {

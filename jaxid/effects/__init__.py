@@ -3,6 +3,7 @@
 from ._base import AbstractEffect as AbstractEffect
 from ._base import AbstractTransmission as AbstractTransmission
 from ._base import Motion as Motion
+from ._base import check_declared as check_declared
 from ._base import on_joint as on_joint
 from ._base import smooth_sign as smooth_sign
 from ._scene import Scene as Scene

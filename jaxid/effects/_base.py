@@ -6,10 +6,13 @@ from collections.abc import Iterable
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import Array, Bool, Float, Int
 
-from ..parameters import Scalar
+from ..errors import ModelError
+from ..parameters import Scalar, list_parameters, read_values, write_values
 from ._scene import Scene
 
 
@@ -79,8 +82,12 @@ class AbstractEffect(eqx.Module):
         return [cls(joint=j) for j in scene.joints]  # type: ignore[call-arg]
 
     def scaled(self, factor: float) -> "AbstractEffect":
-        """The effect at another size, where a finite setting was screened; itself by default."""
-        return self
+        """The effect at another size, where a finite setting was screened.
+
+        By default what it is linear in, times the factor.
+        """
+        linear = [p for p in list_parameters(self) if p.declaration.free and p.declaration.linear]
+        return write_values(self, linear, factor * read_values(self, linear)) if linear else self
 
     def initial_state(self) -> Float[Array, " states"]:
         """Its own states at rest; none by default."""
@@ -129,6 +136,28 @@ class AbstractTransmission(AbstractEffect):
     def through(self, twist: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
         """Torque that the drive passes on to the link at this twist (rad) and rate (rad/s)."""
         raise NotImplementedError
+
+
+def check_declared(effect: AbstractEffect, joints: int) -> None:
+    """Raises `ModelError` where a torque uses an acceleration that it would not be given.
+
+    **Arguments:**
+
+    - `effect`: any. `joints`: of the arm that it is on.
+    """
+    if effect.inertial or effect.needs_acceleration:
+        return
+    zeros = jnp.zeros(joints)
+    state = effect.initial_state()
+    motion = Motion(jnp.zeros(()), zeros, zeros, zeros, zeros, state, jnp.asarray(0))
+    traced = jax.make_jaxpr(lambda a: effect.torque(dataclasses.replace(motion, a=a)))(zeros).jaxpr
+    _, used = dce_jaxpr(traced, [True] * len(traced.outvars))
+    if any(used):
+        raise ModelError(
+            f"{effect.effect_name()} uses motion.a, which is zero for it: write `inertial = True` "
+            "into its class if its torque is proportional to acceleration, or "
+            "`needs_acceleration = True`"
+        )
 
 
 def on_joint(joint: int, value: Float[Array, ""], motion: Motion) -> Float[Array, " joints"]:

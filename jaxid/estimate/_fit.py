@@ -6,6 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Float
 
+from ..effects import check_declared
 from ..errors import FitError
 from ..loop import ClosedLoop
 from ..recording import Recording, Recordings
@@ -31,6 +32,8 @@ def fit(
     """
     recordings = Recordings.of(recordings)
     check_joints(loop, recordings[0])
+    for effect in loop.effects:
+        check_declared(effect, loop.joints)
     method = OEM() if method is None else method
     if not isinstance(method, AbstractMethod):
         raise FitError(f"{method!r} is not a method: give an object such as jaxid.OEM()")

@@ -261,13 +261,15 @@ def oem_of(fit: object) -> OEM:
     return method if isinstance(method, OEM) else OEM()
 
 
-def from_best_starts(method: OEM, loop: ClosedLoop, recordings: Recordings, batch: Batch) -> Batch:
+def from_best_starts(
+    method: OEM, loop: ClosedLoop, recordings: Sequence[Recording], batch: Batch
+) -> Batch:
     """The batch with initial states at which the loop does best, where the method estimates them.
 
     A recording that starts in motion, or that sensors which are off set in motion at once, tells
     its first velocity badly; a fit estimates it, and what is held against a fit must as well.
     """
-    signals, free = _signals(method, loop), _free_starts(method, tuple(recordings), batch)
+    signals, free = _signals(method, loop), _free_starts(method, recordings, batch)
     if not free.any():
         return batch
     weights = jnp.asarray(_first_weights(loop, tuple(recordings), signals))

@@ -1,5 +1,6 @@
 """Which of a table's columns stand for which signal."""
 
+import contextlib
 import itertools
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -86,7 +87,7 @@ def pick(source: str, table: Table, columns: Columns | None) -> Picked:
     if columns is not None or "time" in table.columns:
         known = None
     labels = _resolve(source, table, known[1] if known else columns)
-    signals = {signal: _stack(source, table, names) for signal, names in labels.items()}
+    signals = {signal: _stack(source, table, signal, names) for signal, names in labels.items()}
     return Picked(signals, labels, known is not None and known[0].quantised)
 
 
@@ -159,34 +160,46 @@ def _resolve(source: str, table: Table, columns: Columns | None) -> dict[str, li
 
 def _default_names(source: str, table: Table, signal: str) -> list[str]:
     here = {*table.columns, *table.refused}
-    matches = (re.fullmatch(rf"{signal}_([1-9]\d{{0,3}})", name, re.ASCII) for name in here)
-    numbers = {int(match[1]) for match in matches if match}
+    stem, numbers = f"{signal}_", _numbers(f"{signal}_", here)
+    # A plain v1 may be a voltage; the others mean in every lab what they mean here.
+    if not numbers and signal != "v" and (plain := _numbers(signal, here)):
+        stem, numbers = signal, plain
     if signal in here and numbers:
         raise problem(
             source,
-            f"there are both {signal} and {signal}_{min(numbers)}",
+            f"there are both {signal} and {stem}{min(numbers)}",
             f"keep one, or say which with columns={{'{signal}': ...}}",
         )
     if signal in here:
         return [signal]
     first_absent = next(k for k in itertools.count(1) if k not in numbers)
     if numbers and max(numbers) > first_absent:
-        raise missing(source, table, f"{signal}_{first_absent}", f"{signal}_{max(numbers)}")
-    return [f"{signal}_{k}" for k in range(1, first_absent)]
+        absent, beside = f"{stem}{first_absent}", f"{stem}{max(numbers)}"
+        raise missing(source, table, signal, absent, beside)
+    return [f"{stem}{k}" for k in range(1, first_absent)]
+
+
+def _numbers(stem: str, names: Collection[str]) -> set[int]:
+    """Numbers of the joints that have a column of this stem."""
+    matches = (re.fullmatch(rf"{stem}([1-9]\d{{0,3}})", name, re.ASCII) for name in names)
+    return {int(match[1]) for match in matches if match}
 
 
 def _same_count(source: str, table: Table, labels: dict[str, list[str]], given: Columns) -> None:
     for signal, other in (("q", "tau"), ("tau", "q")):
         if signal not in labels:
-            raise missing(source, table, f"{signal}_1")
+            raise missing(source, table, signal, f"{signal}_1")
         count, more = len(labels[signal]), len(labels[other]) if other in labels else 0
         numbered = signal not in given and labels[signal] != [signal]
         if numbered and count < more:
-            raise missing(source, table, f"{signal}_{count + 1}", labels[other][count])
+            stem = labels[signal][0][:-1]
+            raise missing(source, table, signal, f"{stem}{count + 1}", labels[other][count])
 
 
-def _stack(source: str, table: Table, names: Sequence[str]) -> Float64[np.ndarray, "..."]:
-    columns = [_column(source, table, name) for name in names]
+def _stack(
+    source: str, table: Table, signal: str, names: Sequence[str]
+) -> Float64[np.ndarray, "..."]:
+    columns = [_column(source, table, signal, name) for name in names]
     if len(columns) == 1:
         return columns[0]
     for name, column in zip(names, columns, strict=True):
@@ -200,12 +213,12 @@ def _stack(source: str, table: Table, names: Sequence[str]) -> Float64[np.ndarra
     return np.column_stack(columns)
 
 
-def _column(source: str, table: Table, name: str) -> Float64[np.ndarray, "..."]:
+def _column(source: str, table: Table, signal: str, name: str) -> Float64[np.ndarray, "..."]:
     if name in table.columns:
         return numeric(source, name, table.columns[name])
     if "*" not in name or name in table.refused:
-        raise missing(source, table, name)
-    factors = [_column(source, table, factor.strip()) for factor in name.split("*")]
+        raise missing(source, table, signal, name)
+    factors = [_factor(source, table, signal, factor.strip()) for factor in name.split("*")]
     try:
         with np.errstate(over="ignore"):
             return np.prod(np.broadcast_arrays(*factors), axis=0)
@@ -217,16 +230,22 @@ def _column(source: str, table: Table, name: str) -> Float64[np.ndarray, "..."]:
         ) from error
 
 
-def missing(source: str, table: Table, name: str, beside: str = "") -> Exception:
-    """The error for a column that is not there, or not of a kind that can be read."""
+def _factor(source: str, table: Table, signal: str, name: str) -> Float64[np.ndarray, "..."]:
+    """A factor of a product: a column, or a number as it stands."""
+    if name not in table.columns:
+        with contextlib.suppress(ValueError):
+            return np.asarray(float(name))
+    return _column(source, table, signal, name)
+
+
+def missing(source: str, table: Table, signal: str, name: str, beside: str = "") -> Exception:
+    """The error for a column of a signal that is not there, or not of a kind that can be read."""
     if name in table.refused:
         return problem(
             source,
             f"{brief(name)} is a {table.refused[name]}",
             "save plain arrays of numbers, in MATLAB by save(file, '-struct', 's')",
         )
-    signal = re.sub(r"_\d+$", "", name)
-    signal = signal if signal in SIGNALS else "q"
     what = f"column {brief(name)} is missing" + (f" though {brief(beside)} is there" * bool(beside))
     # A neighbour that is well named is another signal, not this one misspelt.
     well_named = re.compile(rf"({'|'.join(SIGNALS)})(_\d+)?")
@@ -241,5 +260,5 @@ def missing(source: str, table: Table, name: str, beside: str = "") -> Exception
     return problem(
         source,
         f"{what}, there are {brief(list(table.columns))}",
-        f"rename it, or pass columns={{'{signal}': ...}}",
+        f"rename it, or say which it is: columns={{'{signal}': ...}}, --column {signal}=...",
     )
