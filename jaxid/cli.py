@@ -77,6 +77,10 @@ Window = Annotated[
 Report = Annotated[
     Path | None, typer.Option(help="Write the story to this HTML file, which needs no network.")
 ]
+Catalogue = Annotated[
+    list[str] | None,
+    typer.Option(help="FILE.py:NAME of an effect of your own, asked beside the known ones."),
+]
 Quiet = Annotated[
     bool, typer.Option("--quiet", "-q", help="No progress, and the result in a line.")
 ]
@@ -103,8 +107,44 @@ def load_robot(robot: str) -> Any:
         raise ModelError(
             f"there is no robot {robot!r}: choose {', '.join(ready)}, or give FILE.py:NAME"
         )
+    made = getattr(_module(path), name, None)
+    try:
+        made = made() if callable(made) and not isinstance(made, ClosedLoop) else made
+    except Exception as error:
+        raise ModelError(
+            f"{name}() in {path} fails ({error!r}): give a function without arguments that "
+            "returns a ClosedLoop"
+        ) from error
+    if not isinstance(made, ClosedLoop):
+        raise ModelError(f"{path} has no ClosedLoop called {name!r}: name the one it defines")
+    return made
+
+
+def load_effect(given: str) -> Any:
+    """An effect's class from a Python file, or whatever else a catalogue may hold.
+
+    **Arguments:**
+
+    - `given`: `path/to/file.py:Name`.
+
+    **Raises:** `ModelError` that says what was not found.
+    """
+    path, _, name = given.rpartition(":")
+    if not path.endswith(".py"):
+        raise ModelError(f"--catalogue {given!r} names no effect: give FILE.py:NAME of its class")
+    module = _module(path)
+    if not hasattr(module, name):
+        raise ModelError(f"{path} has no effect called {name!r}: name the class it defines")
+    return getattr(module, name)
+
+
+def _module(path: str) -> Any:
+    """A user's Python file, imported."""
     if not Path(path).is_file():
-        raise ModelError(f"there is no file {path}: give the path of your robot's Python file")
+        raise ModelError(f"there is no file {path}: give the path of your own Python file")
+    known = sys.modules.get(Path(path).stem)
+    if known is not None and getattr(known, "__file__", None) == path:
+        return known
     spec = importlib.util.spec_from_file_location(Path(path).stem, path)
     assert spec is not None
     assert spec.loader is not None
@@ -116,17 +156,7 @@ def load_robot(robot: str) -> Any:
         spec.loader.exec_module(module)
     except Exception as error:
         raise ModelError(f"{path} fails when it is imported ({error!r}): mend it first") from error
-    made = getattr(module, name, None)
-    try:
-        made = made() if callable(made) and not isinstance(made, ClosedLoop) else made
-    except Exception as error:
-        raise ModelError(
-            f"{name}() in {path} fails ({error!r}): give a function without arguments that "
-            "returns a ClosedLoop"
-        ) from error
-    if not isinstance(made, ClosedLoop):
-        raise ModelError(f"{path} has no ClosedLoop called {name!r}: name the one it defines")
-    return made
+    return module
 
 
 def _with_controller(loop: Any, controller: str | None) -> Any:
@@ -279,9 +309,16 @@ def compare(
     unit: Unit = None,
     controller: Controller = None,
     values: Annotated[
-        Path | None, typer.Option("--fit", help="Values from a file that `jaxid fit --json` wrote.")
+        Path | None,
+        typer.Option(
+            "--fit",
+            help="Values that `jaxid fit --json` wrote, or a model that `discover --save` did.",
+        ),
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="Write the figure to this HTML file.")] = None,
+    catalogue: Annotated[
+        list[str] | None, typer.Option(help="FILE.py:NAME of your own effects in a saved model.")
+    ] = None,
     window: Window = None,
     quiet: Quiet = False,
 ) -> None:
@@ -290,6 +327,7 @@ def compare(
     \b
     Examples:
       jaxid compare held_out.csv --fit fit.json --plot compare.html
+      jaxid compare new.csv --fit story.jaxid
       jaxid compare run.csv --robot my_robot.py:loop --json errors.json
 
     The exit code is 0, or 2 where something given cannot be used.
@@ -298,9 +336,13 @@ def compare(
 
     with _sentences():
         _check_outputs(json_file, plot)
-        loop = _with_controller(load_robot(robot), controller)
+        loop = load_robot(robot)
         if values is not None:
-            loop = _with_fitted(loop, values)
+            own = {
+                effect for effect in map(load_effect, catalogue or ()) if isinstance(effect, type)
+            }
+            loop = _with_fitted(loop, values, own)
+        loop = _with_controller(loop, controller)
         result = run_compare(loop, _read(files, column, unit), window=window)
         errors = ", ".join(f"{name} {x:.3f} %" for name, x in _pooled(result).items())
         typer.echo(f"{result.loop.name}: {errors}" if quiet else repr(result))
@@ -314,14 +356,22 @@ def _pooled(result: Any) -> dict[str, float]:
     return ((result.error_percent**2).mean() ** 0.5).to_dict()
 
 
-def _with_fitted(loop: Any, path: Path) -> Any:
+def _with_fitted(loop: Any, path: Path, own: set[type]) -> Any:
+    if path.suffix == ".jaxid":
+        from .archive import classes_of
+        from .saved import load
+
+        saved = load(path, classes_of(loop) | own)
+        if not hasattr(saved, "loop"):
+            raise ModelError(f"{path} holds no model: give a saved fit or story")
+        return saved.loop
     try:
         parameters = json.loads(path.read_text(encoding="utf-8"))["parameters"]
         found = {name: float(entry["value"]) for name, entry in parameters.items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ModelError(
             f"{path} holds no fitted parameters ({error!r}): give a file that "
-            "`jaxid fit --json` wrote"
+            "`jaxid fit --json` or `jaxid discover --save` wrote"
         ) from error
     return loop.with_values(**found)
 
@@ -380,6 +430,11 @@ def discover(
     resume: Annotated[
         Path | None, typer.Option(help="Save each step in this folder, and go on from there.")
     ] = None,
+    save: Annotated[
+        Path | None,
+        typer.Option(help="Write story and model to this file (story.jaxid), for compare --fit."),
+    ] = None,
+    catalogue: Catalogue = None,
     column: Column = None,
     unit: Unit = None,
     controller: Controller = None,
@@ -395,25 +450,31 @@ def discover(
       jaxid discover fit_1.csv fit_2.csv --validate held_out.csv
       jaxid discover run_*.csv --validate held_1.csv held_2.csv --robot my_robot.py:loop \\
             --unit q=deg --json story.json --report story.html --resume steps
+      jaxid discover run_*.csv --catalogue my_effects.py:Hose --save story.jaxid
     """
     from .discovery import discover as run_discover
+    from .effects import catalogue as known
 
     journal = _Kept(resume)
     # The folder outlives the interrupt, whose farewell takes the steps out of it.
     with journal, _sentences(journal.farewell):
-        _check_outputs(json_file, report)
+        _check_outputs(json_file, report, save)
         loop = _with_controller(load_robot(robot), controller)
+        own = [load_effect(given) for given in catalogue or ()]
         held_out = list(validate or [])
         _check_apart(files, held_out)
         story = run_discover(
             loop,
             _read(files, column, unit),
             validate=_read(held_out, column, unit) if held_out else None,
+            catalogue=(*known, *own),
             resume=journal.path,
             progress=not quiet,
         )
         _tell(story, quiet)
         _write(json_file, story.to_dict())
+        if save is not None:
+            story.save(save)
         if report is not None:
             story.report(report)
 

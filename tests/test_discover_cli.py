@@ -22,6 +22,23 @@ DEMO = Path(jaxid.__file__).parent / "demo"
 HIDDEN = [str(DEMO / "hidden" / f"{name}.csv") for name in ("fit_1", "fit_2", "held_out")]
 
 
+HOSE = """
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxid
+
+
+class Hose(jaxid.effects.AbstractEffect):
+    joint: int = eqx.field(static=True)
+    pull: jax.Array = jaxid.parameter(0.0, symbol="hose", unit="N·m", scale=0.1)
+
+    def torque(self, motion):
+        angle = motion.q[self.joint - 1]
+        return jaxid.effects.on_joint(self.joint, self.pull * jnp.sin(2 * angle), motion)
+"""
+
+
 class Told(NamedTuple):
     """One run of the command: what it printed and wrote, and the story itself."""
 
@@ -30,6 +47,7 @@ class Told(NamedTuple):
     json: dict[str, Any]
     page: Path
     journal: Path
+    saved: Path
     story: jaxid.Discovery
 
 
@@ -47,8 +65,10 @@ def told() -> Told:
         return stories[-1]
 
     folder = Path(tempfile.mkdtemp(prefix="jaxid-story-"))
-    out = [folder / name for name in ("story.json", "story.html", "steps")]
-    options = ["--json", str(out[0]), "--report", str(out[1]), "--resume", str(out[2])]
+    out = [folder / name for name in ("story.json", "story.html", "steps", "story.jaxid")]
+    named = zip(("--json", "--report", "--resume", "--save"), map(str, out), strict=True)
+    (folder / "own.py").write_text(HOSE, encoding="utf-8")
+    options = [*(word for pair in named for word in pair), "--catalogue", f"{folder}/own.py:Hose"]
     with mock.patch.object(jaxid.discovery, "discover", kept):
         # Two files after one --validate: the second is held out as well.
         twin = folder / "other_day.csv"
@@ -61,6 +81,7 @@ def told() -> Told:
         json.loads(out[0].read_text(encoding="utf-8")),
         out[1],
         out[2],
+        out[3],
         stories[0],
     )
 
@@ -103,6 +124,30 @@ def test_the_json_has_the_fields_of_its_page() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_an_effect_of_the_users_is_asked_beside_the_known_ones() -> None:
+    asked = {v.key for v in told().story.steps[0].diagnosis.ranking}
+    assert {("hose", 1), ("hose", 2), ("stribeck", 1)} <= asked
+
+
+@pytest.mark.slow
+def test_the_saved_model_can_be_held_against_recordings() -> None:
+    run = told()
+    out = run.saved.with_name("errors.json")
+    command = ["compare", HIDDEN[2], "--fit", str(run.saved), "--json", str(out)]
+    refused = CliRunner().invoke(app, command)
+    assert refused.exit_code == 2
+    assert "Hose" in refused.stderr
+    own = ["--catalogue", f"{run.saved.with_name('own.py')}:Hose"]
+    result = CliRunner().invoke(app, [*command, *own], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert run.story.steps[-1].held_out is not None
+    expected = run.story.steps[-1].held_out.error_percent.iloc[0].tolist()
+    written = json.loads(out.read_text(encoding="utf-8"))
+    assert next(iter(written["error_percent"].values())) == pytest.approx(expected)
+
+
+@pytest.mark.slow
 def test_several_held_out_files_follow_one_option() -> None:
     assert told().story.steps[0].held_out.recordings.names == ("held_out", "other_day")
 
@@ -139,6 +184,9 @@ def test_one_option_takes_several_files(given: str, meant: str) -> None:
         ([HIDDEN[0], "--validate", HIDDEN[0]], "both to be fitted and held out"),
         ([HIDDEN[0], "--robot", "kuka"], "there is no robot 'kuka'"),
         ([HIDDEN[0], "--robot", "absent.py:loop"], "there is no file absent.py"),
+        ([HIDDEN[0], "--catalogue", "absent.py:Hose"], "there is no file absent.py"),
+        ([HIDDEN[0], "--catalogue", "stribeck"], "give FILE.py:NAME of its class"),
+        ([HIDDEN[0], "--catalogue", f"{__file__}:Hose"], "has no effect called 'Hose'"),
         ([HIDDEN[0], "--robot", "emps"], "has 2 joints, but the robot emps has 1"),
         ([HIDDEN[0], "--json", "absent/story.json"], "there is no folder absent"),
         ([HIDDEN[0], "--report", "absent/story.html"], "there is no folder absent"),

@@ -5,19 +5,22 @@ import sys
 
 import equinox as eqx
 import independent as sim
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from independent import effects as fx
 
 import jaxid
-from jaxid.discovery.discover import _entries, _released, _rivals, _Search
+from jaxid.discovery.discover import _doubled, _entries, _released, _rivals, _Search
 from jaxid.discovery.score import corrected, effective_tests
+from jaxid.discovery.signatures import candidates, survey
 from jaxid.discovery.story import Contender, Step
 from jaxid.effects import (
     AbstractEffect,
     Backlash,
     Curve,
+    JointElasticity,
     Motion,
     QuadraticDrag,
     Spring,
@@ -426,6 +429,63 @@ def test_effective_tests_are_honest():
     assert effective_tests(same, blocks) == pytest.approx(1.0, rel=0.15)
     assert effective_tests(apart, blocks) == pytest.approx(40.0, rel=0.15)
     assert corrected(0.01, 10) == pytest.approx(1 - 0.99**10)
+
+
+def test_a_discovery_compares_what_the_loop_is_judged_by():
+    time = np.arange(100) * 0.01
+    q = np.stack([np.sin(time), np.cos(time)], axis=1)
+    record = jaxid.Recording(time, q, q, q_ref=q)
+    for output in ("position", "both"):
+        with pytest.raises(jaxid.errors.FitError, match="leave out output"):
+            jaxid.discover(jaxid.scara(), record, method=jaxid.OEM(output=output), progress=False)
+
+
+def test_a_joint_that_is_held_still_has_shapes_to_screen():
+    time = np.arange(50) * 0.01
+    q = np.stack([np.sin(time), np.full(50, 0.3)], axis=1)
+    record = jaxid.Recording(time, q, q, q_ref=q)
+    rows, zero, v = jnp.asarray(q), jnp.asarray(0 * q), jnp.gradient(jnp.asarray(q), 0.01, axis=0)
+    state, label = jnp.zeros((50, 0)), jnp.zeros(50, int)
+    motion = jax.vmap(Motion)(jnp.asarray(time), rows, v, zero, rows, state, label)
+    motion = jax.tree.map(lambda leaf: leaf[None], motion)
+    scene = survey(jaxid.scara(), jaxid.Recordings.of(record), motion, [[1.0], [1.0]])
+    settings = [effect for effect, _ in candidates(jaxid.catalogue, scene, 1.0)]
+    assert {getattr(e, "joint", 2) for e in settings} == {1, 2}
+    for effect in settings:
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(effect)), effect
+
+
+def test_a_diagnosis_begins_where_its_fit_did():
+    """At a first velocity that a parabola through noisy samples tells badly."""
+    loop = jaxid.emps(jaxid.control.PD(Kp=[9e3], Kv=[600.0])).with_values(M=90.0, gamma1=100.0)
+    loop = dataclasses.replace(loop, freed=frozenset())
+    time = np.arange(0, 3, 0.01)
+    q_ref = 0.1 * np.sin(3 * time[:, None] + 1.0)
+    run = jaxid.simulate(loop, jaxid.Recording(time, q_ref, q_ref, q_ref=q_ref))[0]
+    noise = np.random.default_rng(0).standard_normal((2, len(time), 1))
+    q, tau = np.asarray(run.q) + 2e-4 * noise[0], np.asarray(run.tau) + 0.1 * noise[1]
+    fit = jaxid.fit(loop, jaxid.Recording(time, q, tau, q_ref=q_ref), jaxid.OEM(progress=False))
+    for judged in (fit, jaxid.compare(fit, fit.recordings)):
+        found = jaxid.diagnose(judged, catalogue=(TorqueOffset,), progress=False)
+        left = found.data.residual[0, : len(time)]
+        np.testing.assert_allclose(left, fit.residuals[0], atol=1e-3 * np.abs(left).max())
+
+
+def test_a_transmission_is_no_second_one():
+    loop = jaxid.scara().add(Backlash(joint=1, gap=0.01), TorqueOffset(joint=1))
+    shaft = JointElasticity(joint=1, compliance=0.01)
+    assert _doubled(loop, 1, shaft)
+    assert not _doubled(loop, 2, shaft)
+    assert not _doubled(loop, 1, TorqueOffset(joint=1))
+
+
+@pytest.mark.xdist_group("offset")
+def test_an_experiment_for_a_transmission_is_refused(offset_story):
+    story, _ = offset_story
+    diagnosis = story.steps[0].diagnosis
+    shaft = next(v for v in diagnosis.ranking if v.key == ("joint_elasticity", 1))
+    with pytest.raises(jaxid.errors.FitError, match="joint_elasticity on joint 1 is a simulation"):
+        diagnosis.next_experiment(effects=[diagnosis.ranking[0], shaft])
 
 
 @pytest.mark.xdist_group("offset")

@@ -13,7 +13,7 @@ import pytest
 from independent import effects as fx
 
 import jaxid
-from jaxid.control import PD, Sampled
+from jaxid.control import PD, Reading, Reference, Sampled
 from jaxid.effects import (
     AbstractEffect,
     AbstractTransmission,
@@ -23,15 +23,19 @@ from jaxid.effects import (
     EndStop,
     Gravity,
     JointElasticity,
+    LoadDependentFriction,
     Motion,
     Payload,
+    RotorInertia,
     Spring,
     TimeDelay,
     TorqueOffset,
+    TorqueRipple,
     Viscous,
     on_joint,
 )
 from jaxid.errors import ModelError
+from jaxid.loop import Outside, instant, inverse, rest
 from jaxid.parameters import Scalar, parameter
 from jaxid.simulate import fastest_rate, with_substeps
 from jaxid.stepping import RK4
@@ -362,6 +366,61 @@ def test_joint_out_of_range_says_which_there_are(joint):
     message = str(raised.value)
     for part in (f"quadratic_drag is on joint {joint}", "scara has joints 1 to 2", "from 1"):
         assert part in message
+
+
+def test_a_joint_has_one_transmission():
+    loop = jaxid.scara().add(JointElasticity(joint=2, compliance=0.01))
+    loop.add(Backlash(joint=1, gap=0.01))
+    with pytest.raises(ModelError, match="two transmissions on joint 2"):
+        loop.add(Backlash(joint=2))
+
+
+def test_what_is_held_stays_so_under_another_name():
+    ripples = TorqueRipple(joint=1, harmonic=3.0), TorqueRipple(joint=1, harmonic=7.0)
+    loop = jaxid.scara().add(*ripples).hold("n1_2", "ZZ2").free("n1", "gamma2")
+    less = loop.with_effects(e for e in loop.effects if e is not ripples[0])
+    assert less.held == {"n1", "ZZ2"}
+    assert less.freed == {"gamma2"}
+    assert loop.without("torque_ripple").held == {"ZZ2"}
+
+
+class Jerky(AbstractEffect):
+    """A torque by acceleration that does not say so."""
+
+    joint: int = eqx.field(static=True)
+    size: Scalar = parameter(0.0, symbol="J", unit="kg·m²")
+
+    def torque(self, motion):
+        return on_joint(self.joint, self.size * motion.a[self.joint - 1], motion)
+
+
+def test_acceleration_that_is_not_asked_for_is_refused():
+    loop = jaxid.scara().add(Jerky(joint=2))
+    q = np.zeros((20, 2))
+    record = jaxid.Recording(np.arange(20) * 0.01, q, q, q_ref=q)
+    with pytest.raises(ModelError, match="jerky uses motion.a.*`inertial = True`"):
+        jaxid.fit(loop, record)
+
+
+def test_simulation_and_inverse_agree_on_the_load():
+    """Beside a rotor, whose acceleration is solved for."""
+    loop = jaxid.scara().add(
+        RotorInertia(joint=2, inertia=0.02), LoadDependentFriction(joint=2, ratio=0.3)
+    )
+    q, v, tau = jnp.array([0.2, 0.4]), jnp.array([1.0, -2.0]), jnp.array([3.0, 2.0])
+    driven = dataclasses.replace(loop, controller=jaxid.control.OpenLoop())
+    none = jnp.zeros(2)
+    state = dataclasses.replace(rest(driven, q, none), v=v)
+    now = instant(
+        driven,
+        jnp.zeros(()),
+        state,
+        Reference(none, none, none, tau),
+        Outside(none, none, Reading(none, none)),
+        jnp.asarray(0),
+    )
+    motion = Motion(jnp.zeros(()), q, v, now.a, tau, jnp.zeros(0), jnp.asarray(0))
+    np.testing.assert_allclose(inverse(driven, motion, state.effects), now.tau, rtol=1e-12)
 
 
 def test_hold_and_free():

@@ -488,7 +488,8 @@ class _Search(eqx.Module):
             return []
         for at, k in enumerate(added):
             rivals = () if steps[k] is final else _rivals(steps[k])
-            fitting = (r for r in rivals if not _doubled(final.fit.loop, len(added) - at, r))
+            loop, place = final.fit.loop, len(added) - at
+            fitting = (r for r in rivals if not _doubled(loop, place, r.fit.loop.effects[-1]))
             for rival in (None, *fitting):
                 refitted = self.replaced(final, len(added) - at, rival, say)
                 value = self.criterion(refitted, final.diagnosis)
@@ -631,9 +632,9 @@ def _rivals(step: Step, most: int = 2) -> list[Contender]:
     ][:most]
 
 
-def _doubled(loop: ClosedLoop, from_end: int, rival: Contender) -> bool:
-    """Whether a rival, in place of an effect, would be a joint's second transmission."""
-    effect, at = rival.fit.loop.effects[-1], len(loop.effects) - from_end
+def _doubled(loop: ClosedLoop, from_end: int, effect: AbstractEffect) -> bool:
+    """Whether an effect, in place of another, would be a joint's second transmission."""
+    at = len(loop.effects) - from_end
     rest = (*loop.effects[:at], *loop.effects[at + 1 :])
     return isinstance(effect, AbstractTransmission) and any(
         isinstance(e, AbstractTransmission) and e.joint == effect.joint for e in rest
