@@ -36,7 +36,7 @@ Examples:
 \b
 Exit codes:
   0    it is done, whatever the verdict
-  1    a fit that found no parameters to trust; its result is printed and written all the same
+  1    a fit that did not converge; its result is printed and written all the same
   2    something given cannot be used; the one line on stderr says what to do
   130  interrupted by Ctrl-C
 
@@ -54,7 +54,10 @@ app = typer.Typer(
 # What shells give for a command that Ctrl-C ended.
 INTERRUPTED = 130
 
-Files = Annotated[list[Path], typer.Argument(help="Recordings: .csv, .parquet, .mat or .npz.")]
+Files = Annotated[
+    list[Path],
+    typer.Argument(help="Recordings: .csv, .tsv, .txt, .parquet, .mat or .npz, also .gz."),
+]
 Robot = Annotated[
     str, typer.Option(help="scara, two-link, emps, or FILE.py:NAME for a loop of your own.")
 ]
@@ -269,8 +272,7 @@ def fit(
       jaxid fit run.mat --robot emps --method idim
       jaxid fit run.csv --robot my_robot.py:loop --column q=pos_a,pos_b --unit q=deg
 
-    The exit code is 0, 1 where no parameters were found that can be trusted, 2 where something
-    given cannot be used.
+    The exit code is 0, 1 where the fit did not converge, 2 where something given cannot be used.
     """
     from . import estimate
 

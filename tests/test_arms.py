@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxid
-from jaxid.arms import SCARA, Axis, TwoLink
+from jaxid.arms import SCARA, AbstractArm, Axis, TwoLink
 from jaxid.control import OpenLoop
 from jaxid.effects import AbstractEffect, Coulomb, Motion, Viscous, smooth_sign
 from jaxid.errors import ModelError
@@ -139,6 +139,19 @@ def test_axis_obeys_its_lagrangian():
 
     masses = jnp.linspace(0.1, 200.0, 20)
     assert_same_dynamics(*jax.jit(jax.vmap(one))(masses, *draw_motions(3, 20, 1)))
+
+
+@pytest.mark.parametrize("name", TWO_LINKED)
+def test_regressor_that_is_written_out_is_the_one_that_follows(name):
+    build, _, aligned = TWO_LINKED[name]
+
+    def both(links, *motion):
+        arm = build(links)
+        return arm.regressor(*motion), AbstractArm.regressor(arm, *motion)
+
+    drawn = draw_links(11, 20, aligned), *draw_motions(12, 20, 2)
+    written, following = jax.jit(jax.vmap(both))(*drawn)
+    np.testing.assert_allclose(written, following, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["scara", "two_link"])

@@ -6,10 +6,14 @@ import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jaxid
+from jaxid.control import Reading, Reference
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -94,3 +98,23 @@ def test_pictures_named_in_the_readme_are_there_and_small() -> None:
     for path in named:
         assert (ROOT / path).is_file(), path
         assert (ROOT / path).stat().st_size < 400_000
+
+
+def test_code_of_bring_your_own_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(jaxid, "read", lambda *files, **given: asked.append(given))
+    monkeypatch.setattr(jaxid, "discover", lambda *args, **given: asked.append(given))
+    text = (DOCS / "your-own.md").read_text(encoding="utf-8")
+    own: dict[str, Any] = {"jaxid": jaxid, "recordings": None}
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(block, own)
+    assert set(asked[0]["columns"]) == {"time", "q", "tau"}
+    assert asked[1]["catalogue"][-1] is own["Hose"]
+    # Stretched out level, three masses of 1 kg hang on the first joint at 0.4, 0.7 and 0.9 m.
+    q, none = jnp.array([jnp.pi / 2, 0.0, 0.0]), jnp.zeros(3)
+    held = own["ThreeLinks"]().bias(q, none)
+    np.testing.assert_allclose(held, [9.81 * 2.0, 9.81 * 0.8, 9.81 * 0.2], rtol=1e-12)
+    law = own["PID"](Kp=jnp.ones(3), Ki=2 * jnp.ones(3), Kd=jnp.ones(3))
+    reading, reference = Reading(none, none), Reference(q, none, none, none)
+    state = law.initial_state(reading) + law.derivative(reading, reference, none)
+    np.testing.assert_allclose(law.command(reading, reference, state, jnp.eye(3)), 3 * q)

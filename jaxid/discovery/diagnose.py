@@ -414,7 +414,7 @@ def _check_finite(
     loop: ClosedLoop, hypotheses: Sequence[Hypothesis], table: Float[np.ndarray, "..."]
 ) -> None:
     """Raises `FitError` where a signature is not finite."""
-    there = np.isfinite(table).all(axis=(0, 1, 2))
+    there = np.asarray(np.isfinite(table).all(axis=(0, 1, 2)))
     bad = [h for h in hypotheses if not there[list(h.columns)].all()]
     if len(bad) > len(hypotheses) / 2:
         raise FitError(

@@ -19,7 +19,7 @@ from ._least_squares import Problem, Sensitivity, absorb_start, linearise, unfil
 Deviations = Literal["sandwich", "white", "paper"]
 
 SAID = {
-    "sandwich": "sandwich estimate, right for whatever colour the residuals have",
+    "sandwich": "sandwich estimate, which allows for coloured residuals",
     "white": "equation (A.1) with the gradient of the filtered error, right if that error is white",
     "paper": "equation (A.1) with the filtered error's variance but the unfiltered gradient, as "
     "printed by Brunot et al. 2016: not to be trusted",
