@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from ..archive import classes_of
 from ..campaign import Campaign
+from ..control import OpenLoop
 from ..effects import AbstractEffect, AbstractTransmission
 from ..effects import catalogue as known
 from ..errors import FitError
@@ -61,10 +62,11 @@ def discover(
     another call.
     """
     started = time.perf_counter()
-    if method is not None and method.output is not None:
+    judged = "position" if isinstance(loop.controller, OpenLoop) else "torque"
+    if method is not None and method.output not in (None, judged):
         raise FitError(
-            f"a discovery compares what the loop is judged by, not OEM(output={method.output!r}): "
-            "leave out output"
+            f"a discovery compares {judged}, by which {loop.name} is judged, and not "
+            f"OEM(output={method.output!r}): leave out output"
         )
     recordings = Recordings.of(recordings)
     held_out = None if validate is None else Recordings.of(validate)
