@@ -340,9 +340,7 @@ def compare(
         _check_outputs(json_file, plot)
         loop = load_robot(robot)
         if values is not None:
-            own = {
-                effect for effect in map(load_effect, catalogue or ()) if isinstance(effect, type)
-            }
+            own = frozenset(e for e in map(load_effect, catalogue or ()) if isinstance(e, type))
             loop = _with_fitted(loop, values, own)
         loop = _with_controller(loop, controller)
         result = run_compare(loop, _read(files, column, unit), window=window)
@@ -358,7 +356,7 @@ def _pooled(result: Any) -> dict[str, float]:
     return ((result.error_percent**2).mean() ** 0.5).to_dict()
 
 
-def _with_fitted(loop: Any, path: Path, own: set[type]) -> Any:
+def _with_fitted(loop: Any, path: Path, own: frozenset[type] = frozenset()) -> Any:
     if path.suffix == ".jaxid":
         from .archive import classes_of
         from .saved import load

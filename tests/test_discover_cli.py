@@ -1,5 +1,6 @@
 """`jaxid discover` and `jaxid demo` on the bundled recordings, and what users get wrong."""
 
+import dataclasses
 import functools
 import json
 import tempfile
@@ -12,7 +13,7 @@ from typer.testing import CliRunner
 
 import jaxid
 import jaxid.discovery
-from jaxid.cli import app, spread
+from jaxid.cli import app, load_effect, spread
 
 # What one worker has fitted serves all of them.
 pytestmark = pytest.mark.xdist_group("demo")
@@ -67,8 +68,7 @@ def told() -> Told:
     folder = Path(tempfile.mkdtemp(prefix="jaxid-story-"))
     out = [folder / name for name in ("story.json", "story.html", "steps", "story.jaxid")]
     named = zip(("--json", "--report", "--resume", "--save"), map(str, out), strict=True)
-    (folder / "own.py").write_text(HOSE, encoding="utf-8")
-    options = [*(word for pair in named for word in pair), "--catalogue", f"{folder}/own.py:Hose"]
+    options = [word for pair in named for word in pair]
     with mock.patch.object(jaxid.discovery, "discover", kept):
         # Two files after one --validate: the second is held out as well.
         twin = folder / "other_day.csv"
@@ -125,26 +125,47 @@ def test_the_json_has_the_fields_of_its_page() -> None:
 
 @pytest.mark.slow
 @pytest.mark.slow
-def test_an_effect_of_the_users_is_asked_beside_the_known_ones() -> None:
-    asked = {v.key for v in told().story.steps[0].diagnosis.ranking}
-    assert {("hose", 1), ("hose", 2), ("stribeck", 1)} <= asked
+def test_an_effect_of_the_users_is_asked_beside_the_known_ones(tmp_path: Path) -> None:
+    asked: list[Any] = []
+
+    def listening(*args: Any, catalogue: Any, **settings: Any) -> jaxid.Discovery:
+        asked.extend(catalogue)
+        return told().story
+
+    (tmp_path / "own.py").write_text(HOSE, encoding="utf-8")
+    own = ["--catalogue", str(tmp_path / "own.py") + ":Hose"]
+    with mock.patch.object(jaxid.discovery, "discover", listening):
+        run = CliRunner().invoke(app, ["discover", *HIDDEN[:2], *own], catch_exceptions=False)
+    assert run.exit_code == 0
+    assert tuple(asked[:-1]) == jaxid.catalogue
+    assert asked[-1].effect_name() == "hose"
 
 
 @pytest.mark.slow
-def test_the_saved_model_can_be_held_against_recordings() -> None:
+def test_the_saved_model_can_be_held_against_recordings(tmp_path: Path) -> None:
     run = told()
-    out = run.saved.with_name("errors.json")
-    command = ["compare", HIDDEN[2], "--fit", str(run.saved), "--json", str(out)]
-    refused = CliRunner().invoke(app, command)
-    assert refused.exit_code == 2
-    assert "Hose" in refused.stderr
-    own = ["--catalogue", f"{run.saved.with_name('own.py')}:Hose"]
-    result = CliRunner().invoke(app, [*command, *own], catch_exceptions=False)
+    command = ["compare", HIDDEN[2], "--fit", str(run.saved), "--json", str(tmp_path / "e.json")]
+    result = CliRunner().invoke(app, command, catch_exceptions=False)
     assert result.exit_code == 0
     assert run.story.steps[-1].held_out is not None
     expected = run.story.steps[-1].held_out.error_percent.iloc[0].tolist()
-    written = json.loads(out.read_text(encoding="utf-8"))
+    written = json.loads((tmp_path / "e.json").read_text(encoding="utf-8"))
     assert next(iter(written["error_percent"].values())) == pytest.approx(expected)
+
+
+@pytest.mark.slow
+def test_a_saved_effect_of_the_users_is_found_in_its_file(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(HOSE, encoding="utf-8")
+    given = str(tmp_path / "own.py") + ":Hose"
+    fit = told().story.fit
+    hose = load_effect(given)(joint=1)
+    path = dataclasses.replace(fit, loop=fit.loop.add(hose)).save(tmp_path / "fit.jaxid")
+    command = ["compare", HIDDEN[2], "--fit", str(path)]
+    refused = CliRunner().invoke(app, command)
+    assert refused.exit_code == 2
+    assert "Hose" in refused.stderr
+    result = CliRunner().invoke(app, [*command, "--catalogue", given], catch_exceptions=False)
+    assert result.exit_code == 0
 
 
 @pytest.mark.slow
