@@ -279,7 +279,7 @@ class Bounds(eqx.Module):
         )
 
     def moved_inside(self, values: Vector) -> Vector:
-        """The values, those on a bound or beyond it moved just inside.
+        """The values, `(parameters,)`, those on a bound or beyond it moved just inside.
 
         Those that are inside stay, however near: a small robot's values are all near zero.
         """

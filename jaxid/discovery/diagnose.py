@@ -411,7 +411,9 @@ def diagnose(
 
 
 def _check_finite(
-    loop: ClosedLoop, hypotheses: Sequence[Hypothesis], table: Float[np.ndarray, "..."]
+    loop: ClosedLoop,
+    hypotheses: Sequence[Hypothesis],
+    table: Float[np.ndarray, "recordings points outputs columns"],
 ) -> None:
     """Raises `FitError` where a signature is not finite."""
     there = np.asarray(np.isfinite(table).all(axis=(0, 1, 2)))
@@ -444,18 +446,17 @@ def _as_fitted(fit: Fit | Comparison, loop: ClosedLoop) -> tuple[str, Batch, np.
     return _signals(method, loop)[0], batch, free
 
 
-def _sampled(batch: Batch, motion: Motion) -> Motion:
-    """A motion at the samples alone, where the grid has points between them."""
+def _sampled(batch: Batch, tree: Any) -> Any:
+    """Leaves of `(recordings, points, ...)` at the samples alone, of a grid that may be finer."""
     if batch.at is None:
-        return motion
+        return tree
     rows = np.arange(len(batch.at))[:, None], np.asarray(batch.at)
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[rows], motion)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[rows], tree)
 
 
 def _at_samples(batch: Batch, x: Float[np.ndarray, "recordings points *axes"]) -> np.ndarray:
     """Rows at the samples, in the band that is compared, zero where there is no sample."""
-    if batch.at is not None:
-        x = np.stack([row[at] for row, at in zip(x, np.asarray(batch.at), strict=True)])
+    x = _sampled(batch, x)
     mask = np.asarray(batch.mask).reshape(*batch.mask.shape, *(1,) * (x.ndim - 2))
     x = x * mask.astype(x.dtype)
     return x if batch.band is None else np.asarray(batch.band(jnp.asarray(x)), x.dtype)
@@ -464,9 +465,7 @@ def _at_samples(batch: Batch, x: Float[np.ndarray, "recordings points *axes"]) -
 def _residual_and_base(
     batch: Batch, linear: Linearised, loop: ClosedLoop, output: str, free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    seen = np.asarray(linear.seen[:, :, {"tau": 0, "q": 1}[output]])
-    if batch.at is not None:
-        seen = np.stack([row[at] for row, at in zip(seen, np.asarray(batch.at), strict=True)])
+    seen = _sampled(batch, np.asarray(linear.seen[:, :, {"tau": 0, "q": 1}[output]]))
     residual = (np.asarray(getattr(batch, output)) - seen) * np.asarray(batch.mask)[..., None]
     if batch.band is not None:
         residual = np.asarray(batch.band(jnp.asarray(residual)))

@@ -18,7 +18,7 @@ from ..loop import ClosedLoop
 from ..recording import Recording
 from ..showing import AbstractShown
 from ..simulate import prepare, with_substeps
-from .diagnose import Diagnosis, Verdict, _at_samples
+from .diagnose import Diagnosis, Verdict, _at_samples, _sampled
 from .linear import base_columns, linearise
 from .score import Data, Gram
 from .signatures import signatures
@@ -180,9 +180,7 @@ def _separations(
     hypotheses, table = signatures(loop, batch, linear, proposed, 0, lambda text: None)
     base = _at_samples(batch, np.asarray(base_columns(linear, loop.theta.shape[0], False)))
     rows = _at_samples(batch, table)
-    seen = np.asarray(linear.seen)
-    if batch.at is not None:
-        seen = np.stack([row[at] for row, at in zip(seen, np.asarray(batch.at), strict=True)])
+    seen = _sampled(batch, np.asarray(linear.seen))
     kept = np.asarray(batch.kept)
     columns = [list(h.columns) for h in hypotheses]
     sizes = [diagnosis.gram.amplitude(v.hypothesis.columns)[0] for v in chosen]
