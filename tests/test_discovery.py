@@ -409,6 +409,21 @@ def test_a_search_that_was_told_to_stop_says_so(offset_story):
     assert "told to stop" in dataclasses.replace(story, unfinished=True).sentence
 
 
+@pytest.mark.xdist_group("offset")
+def test_the_recording_that_an_effect_is_on_is_named(offset_case, offset_story):
+    start = offset_story[0].steps[0]
+    verdict = next(v for v in start.diagnosis.ranking if v.key == ("payload", None))
+    payload = start.diagnosis.predicted(verdict)
+    (name,) = payload.recordings
+    shown = start.diagnosis.table().set_index("effect").loc["payload", "amplitude"]
+    assert shown.endswith(f" kg in {name}")
+    steps = with_chain(search_of(offset_case), start, payload)
+    story = jaxid.Discovery("explained", tuple(steps))
+    assert f"The model lacked payload in {name};" in story.sentence
+    assert f"payload in {name}: mass" in repr(story)
+    assert story.to_dict()["added"][0]["recordings"] == [name]
+
+
 def test_clean_recordings_are_adequate():
     fit, held_out = recordings_of(sim.make_case(12, effects=[], noise="moderate", duration=12.0))
     story = jaxid.discover(jaxid.scara(), fit, held_out, progress=False)

@@ -175,7 +175,7 @@ class Diagnosis(AbstractShown):
                     "p_value": verdict.p_value,
                     "explained_percent": 100 * verdict.explained / total if total else 0.0,
                     "evidence": verdict.evidence,
-                    "amplitude": size,
+                    "amplitude": size + on_recordings(verdict.hypothesis.effect),
                     "predicted_error_percent": None
                     if error is None
                     else ", ".join(f"{x:.2f}" for x in error),
@@ -628,6 +628,12 @@ def _floor(
     # What is least once whitened may be more than what the model leaves as it is.
     share = np.minimum(error / size, 1) / np.sqrt(max(freedom, 0.1))
     return fit.error_percent.to_numpy() * share
+
+
+def on_recordings(effect: AbstractEffect) -> str:
+    """The recordings that an effect is on, as a sentence goes on; nothing where it is on all."""
+    named = getattr(effect, "recordings", ())
+    return f" in {' and '.join(named)}" if named else ""
 
 
 def effect_parameters(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[int, str, str]]:

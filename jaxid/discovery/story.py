@@ -21,7 +21,7 @@ from ..loop import ClosedLoop
 from ..saved import save
 from ..showing import AbstractShown
 from .compare import Comparison
-from .diagnose import Diagnosis, effect_parameters
+from .diagnose import Diagnosis, effect_parameters, on_recordings
 
 Outcome = Literal["adequate", "explained", "outside_catalogue"]
 
@@ -190,6 +190,7 @@ class Discovery(AbstractShown):
                 {
                     "effect": step.added.effect_name(),
                     "joint": getattr(step.added, "joint", None),
+                    "recordings": list(getattr(step.added, "recordings", ())),
                     "parameters": _found_parameters(self.steps, k),
                     "indistinguishable": [{"effect": n, "joint": j} for n, j in step.alike],
                 }
@@ -244,15 +245,19 @@ def effect_on(name: str, joint: int | None) -> str:
 def _spoken(steps: Sequence[Step]) -> list[str]:
     """Added effects in words; what was added twice is said once."""
     effects = [step.added for step in steps if step.added is not None]
-    counted = Counter(effect_on(e.spoken(), getattr(e, "joint", None)) for e in effects)
+    counted = Counter(_placed(e.spoken(), e) for e in effects)
     often = {1: "", 2: " twice"}
     return [name + often.get(n, f" {n} times") for name, n in counted.items()]
 
 
 def step_name(step: Step) -> str:
-    """What a step added, by name and joint."""
+    """What a step added, by name and joint, and the recordings it is on if it is not on all."""
     assert step.added is not None
-    return effect_on(step.added.effect_name(), getattr(step.added, "joint", None))
+    return _placed(step.added.effect_name(), step.added)
+
+
+def _placed(name: str, effect: AbstractEffect) -> str:
+    return effect_on(name, getattr(effect, "joint", None)) + on_recordings(effect)
 
 
 def _rms(table: pd.DataFrame) -> Float[np.ndarray, " joints"]:
