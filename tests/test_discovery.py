@@ -184,6 +184,15 @@ def test_missing_effect_is_found_added_and_leaves_the_floor(offset_case, offset_
 
 
 @pytest.mark.xdist_group("offset")
+def test_predicted_error_is_the_one_that_adding_leaves(offset_story):
+    story, _ = offset_story
+    start = story.steps[0].diagnosis
+    predicted = start.predicted_error(start.ranking[0])
+    np.testing.assert_allclose(predicted, story.to_dict()["error_percent"]["after"]["fit"], 0.02)
+    assert story.table().iloc[0, 1] > 1.1 * predicted[1]
+
+
+@pytest.mark.xdist_group("offset")
 def test_interrupted_discovery_ends_as_an_undisturbed_one(offset_case, offset_story):
     story, journal = offset_story
     # As if it had been killed after the starting model was done.

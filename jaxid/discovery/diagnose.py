@@ -124,13 +124,10 @@ class Diagnosis(AbstractShown):
         return values, np.sqrt(np.diag(covariance))
 
     def predicted_error(self, verdict: Verdict) -> Float[np.ndarray, " joints"]:
-        """Relative error over all fitted recordings that adding the effect would leave, %."""
+        """Relative error on the fitted recordings that adding the effect would leave, %."""
         rest = leftover(self.data, self.noise, verdict.hypothesis.columns)
-        return 100 * np.sqrt(np.sum(rest**2, axis=(0, 1))) / self._measured()
-
-    def _measured(self) -> Float[np.ndarray, " joints"]:
-        error = np.sqrt(np.sum(self.data.residual**2, axis=(0, 1)))
-        return error / (total_percent(self.fit) / 100)
+        share = _share_left(self.fit, self.data, rest)
+        return over_recordings(self.fit.error_percent.to_numpy() * share)
 
     def correlation(self, one: Verdict, other: Verdict) -> float:
         """Largest correlation of two effects' signatures, what the model absorbs taken off."""
@@ -307,7 +304,7 @@ class Diagnosis(AbstractShown):
 
     def floor_percent(self) -> Float[np.ndarray, " joints"]:
         """Relative error that a perfect model would leave on the fitted recordings, %."""
-        return np.sqrt(np.mean(self.floor**2, axis=0))
+        return over_recordings(self.floor)
 
     def __repr__(self) -> str:
         table = self.table().head(12)
@@ -335,14 +332,6 @@ def coordinate_unit(curve: Curve, torque: Sequence[str], position: Sequence[str]
     if curve.coordinate == "tau":
         return torque[curve.of - 1]
     return position[curve.of - 1] + {"v": "/s", "a": "/s²"}.get(curve.coordinate, "")
-
-
-def total_percent(fit: Fit | Comparison) -> Float[np.ndarray, " joints"]:
-    """Relative error of a fit over all its recordings together, %."""
-    table = fit.error_percent.to_numpy()
-    error = np.stack([np.linalg.norm(r, axis=0) for r in fit.residuals])
-    size = 100 * error / np.where(table > 0, table, np.inf)
-    return 100 * np.sqrt((error**2).sum(axis=0)) / np.sqrt((size**2).sum(axis=0))
 
 
 def diagnose(
@@ -620,14 +609,25 @@ def _floor(
     """Relative error by recording and joint of noise alone, what the model took of it put back."""
     outputs = data.residual.shape[2]
     freedom = 1 - (data.base.shape[-1] + lost) / (data.mask.sum() * outputs)
-    if len(data.residual) != len(fit.residuals):
-        level = np.sqrt(np.sum(rest**2, axis=(0, 1)) / np.sum(data.residual**2, axis=(0, 1)))
-        return fit.error_percent.to_numpy() * level
-    error = np.sqrt(np.sum(rest**2, axis=1))
-    size = np.sqrt(np.sum(data.residual**2, axis=1))
     # What is least once whitened may be more than what the model leaves as it is.
-    share = np.minimum(error / size, 1) / np.sqrt(max(freedom, 0.1))
+    share = np.minimum(_share_left(fit, data, rest), 1) / np.sqrt(max(freedom, 0.1))
     return fit.error_percent.to_numpy() * share
+
+
+def _share_left(
+    fit: Fit | Comparison, data: Data, rest: np.ndarray
+) -> Float[np.ndarray, "recordings joints"]:
+    """What is left of a fit's error; of all its recordings together where data are windows."""
+    over = 1 if len(data.residual) == len(fit.residuals) else (0, 1)
+    share = np.sqrt(np.sum(rest**2, axis=over) / np.sum(data.residual**2, axis=over))
+    return np.broadcast_to(share, (len(fit.residuals), data.residual.shape[2]))
+
+
+def over_recordings(
+    percent: Float[np.ndarray, "recordings joints"],
+) -> Float[np.ndarray, " joints"]:
+    """Relative errors of several recordings in one for each joint: their quadratic mean, %."""
+    return np.sqrt(np.mean(percent**2, axis=0))
 
 
 def on_recordings(effect: AbstractEffect) -> str:

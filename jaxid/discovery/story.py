@@ -21,7 +21,7 @@ from ..loop import ClosedLoop
 from ..saved import save
 from ..showing import AbstractShown
 from .compare import Comparison
-from .diagnose import Diagnosis, effect_parameters, on_recordings
+from .diagnose import Diagnosis, effect_parameters, on_recordings, over_recordings
 
 Outcome = Literal["adequate", "explained", "outside_catalogue"]
 
@@ -261,7 +261,7 @@ def _placed(name: str, effect: AbstractEffect) -> str:
 
 
 def _rms(table: pd.DataFrame) -> Float[np.ndarray, " joints"]:
-    return np.sqrt(np.mean(table.to_numpy() ** 2, axis=0))
+    return over_recordings(table.to_numpy())
 
 
 def _errors(step: Step) -> dict[str, list[float]]:
