@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from .control import Reading, Reference
-from .errors import RecordingError
+from .errors import JaxidError, ModelError, RecordingError
 from .loop import ClosedLoop, Instant, Outside, State, behind, instant, rest, settle
 from .recording import Recording, Recordings
 from .smoothing import Band
@@ -194,6 +194,39 @@ def check_joints(loop: ClosedLoop, recording: Recording) -> None:
         )
 
 
+def check_law(loop: ClosedLoop) -> None:
+    """Raises `ModelError` where a controller's gains are those of other joints than the arm's."""
+    n = loop.joints
+
+    def command(zeros):
+        reading = Reading(zeros, zeros)
+        reference = Reference(zeros, zeros, zeros, zeros)
+        law = loop.controller
+        return law.command(reading, reference, law.initial_state(reading), jnp.outer(zeros, zeros))
+
+    who = f"{type(loop.controller).__name__} of {loop.name}"
+    try:
+        shape = jax.eval_shape(command, jnp.zeros(n)).shape
+    except JaxidError:
+        raise
+    except (TypeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise ModelError(f"{who} has no torque for {n} joints, give all gains: {reason}") from error
+    if shape != (n,):
+        raise ModelError(f"{who} commands torques of shape {shape}, where there are {n} joints")
+
+
+def _check_noise(noise: Sequence[np.ndarray], recordings: Recordings | Sequence[Recording]) -> None:
+    if len(noise) != len(recordings):
+        raise RecordingError(f"noise is given for {len(noise)} of {len(recordings)} recordings")
+    for k, recording in enumerate(recordings):
+        if np.shape(noise[k]) != recording.q.shape:
+            raise RecordingError(
+                f"noise of shape {np.shape(noise[k])} is given for {recording.name}, whose "
+                f"positions have {recording.q.shape}"
+            )
+
+
 def prepare(
     loop: ClosedLoop,
     recordings: Recordings | Sequence[Recording],
@@ -210,6 +243,9 @@ def prepare(
     **Raises:** `RecordingError` where the joints do not match, `ModelError` from the controller.
     """
     check_joints(loop, recordings[0])
+    check_law(loop)
+    if noise is not None:
+        _check_noise(noise, recordings)
     period = loop.controller.period
     grids = [_grid(r, period) for r in recordings]
     length = max(len(grid) for grid, _ in grids)
@@ -493,8 +529,8 @@ def simulate(
     **Raises:** `RecordingError` or `ModelError` where the two do not fit together.
     """
     recordings = Recordings.of(recordings)
-    loop = with_substeps(loop, recordings)
-    return by_recording(simulate_batch(loop, prepare(loop, recordings, noise)), recordings)
+    batch = prepare(loop, recordings, noise)
+    return by_recording(simulate_batch(with_substeps(loop, recordings), batch), recordings)
 
 
 def by_recording(

@@ -1,5 +1,6 @@
 """Zero-phase low-passes: how far up a recorded motion is signal, and the filter that keeps it."""
 
+import dataclasses
 import itertools
 
 import equinox as eqx
@@ -35,6 +36,17 @@ def low_pass(
 def even_times(recording: Recording) -> Float[np.ndarray, " samples"]:
     """As many even times as a recording has samples, over the same span, s."""
     return np.linspace(recording.time[0], recording.time[-1], recording.samples)
+
+
+def evened(recording: Recording) -> Recording:
+    """A recording on as many even times, all its signals by cubic splines; itself if it is even."""
+    time = even_times(recording)
+    if np.allclose(recording.time, time, rtol=0, atol=1e-6 * (time[1] - time[0])):
+        return recording
+    names = ("q", "tau", "q_ref", "v", "tau_ff")
+    signals = {n: x for n in names if (x := getattr(recording, n)) is not None}
+    made = {n: resampled(recording.time, x, time) for n, x in signals.items()}
+    return dataclasses.replace(recording, time=time, **made)
 
 
 def resampled(

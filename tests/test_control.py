@@ -13,7 +13,7 @@ import pytest
 import jaxid
 from jaxid.control import PD, Cascade, OpenLoop, Sampled, Tracking
 from jaxid.effects import Motion
-from jaxid.errors import ModelError
+from jaxid.errors import ModelError, RecordingError
 from jaxid.loop import inverse
 
 GAINS = {"Kp": (6.25, 156.25), "Kv": (2.0, 25.0), "Kg": (3.5, 0.06)}
@@ -333,3 +333,17 @@ def test_recording_of_another_robot_names_both():
     q = np.sin(time)[:, None]
     with pytest.raises(jaxid.errors.RecordingError, match="1 joints.*robot scara has 2"):
         jaxid.simulate(jaxid.scara(), jaxid.Recording(time, q, q, q_ref=q))
+
+
+def test_laws_of_other_joints_are_refused():
+    time = np.linspace(0, 3, 301)
+    q = np.stack([np.sin(2 * time), np.cos(3 * time)], axis=1)
+    recording = jaxid.Recording.from_arrays(time, q, q, q_ref=q, name="one")
+    for law in (PD(Kp=[9.0, 9.0, 9.0], Kv=1.0), jaxid.emps().controller):
+        loop = dataclasses.replace(jaxid.scara(), controller=law)
+        for work in (jaxid.simulate, jaxid.fit):
+            with pytest.raises(ModelError, match="of scara has no torque for 2 joints"):
+                work(loop, recording)
+    for noise in ([], [np.zeros((300, 2))]):
+        with pytest.raises(RecordingError, match="noise"):
+            jaxid.simulate(jaxid.scara(), recording, noise=noise)

@@ -9,7 +9,7 @@ import pytest
 import jaxid
 from jaxid.errors import FitError, LimitsError
 from jaxid.excitation import optimal
-from jaxid.excitation._information import Settings, closed_loop_columns
+from jaxid.excitation._information import Settings, closed_loop_columns, torque_along
 from jaxid.fourier import fourier_basis
 from jaxid.simulate import set_substeps
 
@@ -224,6 +224,31 @@ def test_the_limit_that_leaves_no_pose_is_named():
         jaxid.optimal_excitation(loop(), limits(), start=[0.0, 3.0])
     with pytest.raises(LimitsError, match="workspace's x goes from 1 to 0"):
         jaxid.PlanarReach((0.3, 0.2), low=(1.0, 0.0), high=(0.0, 1.0))
+
+
+def test_torque_is_what_must_be_commanded():
+    t = np.linspace(0.0, 2.0, 200)
+    q = np.stack([0.6 * np.sin(3 * t), 0.4 * np.cos(5 * t)], axis=1)
+    v = np.stack([1.8 * np.cos(3 * t), -2.0 * np.sin(5 * t)], axis=1)
+    a = np.stack([-5.4 * np.sin(3 * t), -10.0 * np.cos(5 * t)], axis=1)
+    plain = [
+        sim.inverse_dynamics(TRUE, *(x.tolist() for x in r)) for r in zip(q, v, a, strict=True)
+    ]
+
+    def asked(*effects):
+        signals = jnp.asarray(np.stack([q, v, a]))
+        return np.asarray(torque_along(loop().add(*effects), jnp.asarray(t), signals))
+
+    assert np.allclose(asked(), plain)
+    weak = asked(jaxid.effects.DriveGain(joint=1, gain=-0.3))
+    assert np.allclose(weak, np.asarray(plain) / [0.7, 1.0])
+    # A share of what reaches the link is lost on the way: to what the law itself says.
+    sticky = jaxid.effects.LoadDependentFriction(joint=2, ratio=0.4)
+    loss = asked(sticky) - np.asarray(plain)
+    assert np.abs(loss[:, 0]).max() < 1e-12
+    assert np.abs(loss[:, 1]).max() > 0.2 * np.abs(plain)[:, 1].max()
+    # What lags is taken to follow at once.
+    assert np.allclose(asked(jaxid.effects.ActuatorLag(joint=1, time_constant=0.02)), plain)
 
 
 def test_settings_that_make_no_reference_are_said():

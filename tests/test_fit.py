@@ -1,6 +1,7 @@
 """Output error on a robot that jaxid did not simulate: truth, honesty, and how fits fail."""
 
 import dataclasses
+from typing import Literal
 
 import independent as sim
 import jax.numpy as jnp
@@ -10,10 +11,17 @@ from scipy import optimize
 
 import jaxid
 from jaxid.control import OpenLoop, Tracking
-from jaxid.effects import TorqueOffset
+from jaxid.effects import (
+    EncoderEccentricity,
+    Hysteresis,
+    JointElasticity,
+    TorqueOffset,
+    Viscous,
+)
 from jaxid.errors import FitError, RecordingError
 from jaxid.estimate import _least_squares as ls
 from jaxid.estimate._base import determined_covariance
+from jaxid.settings import _words, check_words
 
 # What one worker has fitted serves all of them.
 pytestmark = pytest.mark.xdist_group("fit")
@@ -225,6 +233,69 @@ def test_what_cannot_be_fitted_is_refused_with_what_to_do(cases, change, method,
     loop = dataclasses.replace(jaxid.scara(), **change)
     with pytest.raises(error, match=says):
         jaxid.fit(loop, both(cases[0])[0], method)
+
+
+def test_regressions_say_what_they_cannot_see(cases):
+    one = both(cases[0])[0]
+    for effect in (EncoderEccentricity(joint=1), JointElasticity(joint=1)):
+        for method in (jaxid.IDIM(), jaxid.DIDIM(), jaxid.IDIMIV(), jaxid.IntegralLS()):
+            with pytest.raises(FitError, match=f"{effect.effect_name()} sets apart: use OEM"):
+                jaxid.fit(jaxid.scara().add(effect), one, method)
+    held = jaxid.scara().hold(*jaxid.scara().names)
+    for method in (jaxid.IDIM(), jaxid.IntegralLS(), jaxid.SeparablePEM()):
+        with pytest.raises(FitError, match="no free parameter to estimate"):
+            jaxid.fit(held, one, method)
+    with pytest.raises(FitError, match="no free parameter in which torque is linear"):
+        jaxid.fit(held.free("gamma1"), one, jaxid.IDIM())
+
+
+def test_a_regression_says_which_values_are_outside_their_bounds(cases):
+    one = both(cases[0])[0]
+    pushed = one.tau - 2.0 * np.gradient(one.q, one.period, axis=0) * [1.0, 0.0]
+    fit = jaxid.fit(jaxid.scara(), dataclasses.replace(one, tau=pushed), jaxid.IDIM())
+    assert fit.theta[fit.names.index("Fv1")] < 0
+    assert any(note.startswith("Fv1 outside the declared bounds") for note in fit.notes)
+
+
+def test_a_word_that_a_setting_does_not_know_is_refused():
+    @dataclasses.dataclass
+    class Setting:
+        output: Literal["torque", "position"] | None = None
+        count: int = 3
+
+    check_words(Setting())
+    check_words(Setting("position"))
+    with pytest.raises(FitError, match=r"output='torques' of Setting .* \(did you mean 'torque'"):
+        check_words(Setting("torques"))
+    assert _words(jaxid.OEM.__dataclass_fields__["initial"].type) == ("auto", "rest", "free")
+
+
+def test_where_zero_is_on_an_axis_says_nothing_of_a_model():
+    time = np.arange(2000) * 0.005
+    q = 0.05 * np.sin(2 * np.pi * 0.7 * time) + 0.03 * np.sin(2 * np.pi * 1.9 * time)
+    away = np.random.default_rng(3).standard_normal(2000).cumsum() * 0.1
+    loop = jaxid.ClosedLoop(jaxid.arms.Axis(2.0), OpenLoop(), name="slide")
+    for zero in (0.0, 3.0):
+        recording = jaxid.Recording.from_arrays(time, q + zero, away - away.mean())
+        fit = jaxid.fit(loop.add(Viscous(joint=1)), recording)
+        assert not fit.succeeded
+        assert any("does not describe these recordings" in note for note in fit.notes)
+
+
+def test_a_gap_and_windows_that_forget_are_said(cases):
+    one = both(cases[0])[0]
+    kept = (one.time < 4.0) | (one.time > 5.0)
+    gapped = jaxid.Recording.from_arrays(
+        one.time[kept], one.q[kept], one.tau[kept], q_ref=one.q_ref[kept], gaps="allow"
+    )
+    fit = jaxid.fit(jaxid.scara(), gapped, jaxid.IDIM())
+    assert any("has a gap of 1.0" in note for note in fit.notes)
+    assert not any("gap" in note for note in jaxid.fit(jaxid.scara(), one, jaxid.IDIM()).notes)
+    windows = jaxid.OEM(window=5.0, max_steps=2)
+    fit = jaxid.fit(jaxid.scara().add(Hysteresis(joint=2, level=0.01)), one, windows)
+    assert any("states of hysteresis at rest" in note for note in fit.notes)
+    # Windows share their end samples, which count once.
+    assert len(fit.residuals[0]) == one.samples
 
 
 def test_a_recording_of_another_robot_is_refused(cases):

@@ -133,6 +133,16 @@ def test_every_method_finds_the_truth_without_noise(name, smooth):
     assert fit.status is jaxid.Status.converged
 
 
+@pytest.mark.parametrize("name", EXACT)
+def test_samples_that_are_missing_here_and_there_move_nothing(name, smooth):
+    kept = np.sort(np.random.default_rng(5).permutation(len(smooth["time"]))[:3200])
+    thinned = recording(smooth, part=kept)
+    steps = np.diff(thinned.time)
+    assert steps.max() > 1.9 * steps.min()
+    fit = jaxid.fit(loop(), thinned, EXACT[name])
+    assert share(fit) < 5e-3
+
+
 def test_a_known_link_length_and_held_parameters_go_through_the_split(smooth):
     arm = jaxid.arms.TwoLink(link_length=TRUE.p3 / TRUE.p5)
     known = dataclasses.replace(loop(), arm=arm).hold(p1=TRUE.p1)

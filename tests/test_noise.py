@@ -24,6 +24,9 @@ SECOND = VectorAR(
 )
 
 
+SECOND_ORDER = ARFilter.from_reflection(np.array([-0.8, 0.5]))
+
+
 def spectrum_of(filt, size=512):
     """Power spectrum by SciPy, from the poles alone."""
     _, response = signal.freqz([1.0], filt.polynomial, worN=size, whole=True)
@@ -128,6 +131,21 @@ def test_ljung_box_p_values_are_true_on_filtered_recordings():
     # Binomial deviations: 1.1 % at 5 %, 2.5 % at 50 %; three and a half of them.
     assert 0.012 < np.mean(np.array(p) < 0.05) < 0.09
     assert 0.41 < np.mean(np.array(p) < 0.5) < 0.59
+
+
+def test_a_loud_recording_does_not_stand_for_all():
+    rng = np.random.default_rng(8)
+    loudness = np.array([1.0, 1.0, 1.0, 10.0])[:, None]
+    drawn = [list(loudness * rng.standard_normal((4, 600))) for _ in range(400)]
+    rejected = np.mean([ljung_box(series).p_value < 0.05 for series in drawn])
+    # 400 tests at 5 %: deviation 1.1 %.
+    assert 0.015 < rejected < 0.085
+    coloured = [list(loudness * SECOND_ORDER.simulate((4, 600), rng)) for _ in range(60)]
+    assert np.median([fit_ar(series, white=0.05).order for series in coloured]) <= 3
+    pooled = fit_ar(coloured[0], 2)
+    assert np.isclose(pooled.gain * pooled.variance, np.var(coloured[0]), rtol=0.1)
+    both = [np.stack([x, 5 * x[::-1]], axis=1) for x in drawn[0]]
+    assert np.allclose(np.diag(fit_var(both, 0).covariance), np.mean(np.square(both), (0, 1)))
 
 
 def test_two_sigma_bounds_hold_for_white_series():

@@ -1,6 +1,7 @@
 """Prediction error methods on a robot that jaxid did not simulate, and what they say of errors."""
 
 import contextlib
+import dataclasses
 import sys
 
 import independent as sim
@@ -11,6 +12,7 @@ import pytest
 import jaxid
 from jaxid.errors import FitError, NoiseError
 from jaxid.estimate import _least_squares as ls
+from jaxid.estimate.refit import Lanes, refit
 from jaxid.noise import ARFilter, fit_var
 
 # What one worker has fitted serves all of them.
@@ -209,6 +211,33 @@ def test_what_the_data_do_not_allow_is_refused_and_the_fit_kept(fits, recording,
         jaxid.fit(jaxid.scara(), recording, method)
     if isinstance(method, jaxid.SeparablePEM):
         assert np.allclose(caught.value.fit.theta, fits["oem"].theta)
+
+
+def test_a_limit_of_time_holds_for_joint_prediction_error_too(recording):
+    hurried = jaxid.OEM(start="given", progress=False, max_seconds=0.0)
+    fit = jaxid.fit(jaxid.scara(), recording, jaxid.JointPEM(hurried, orders=ORDERS))
+    assert fit.status is jaxid.Status.max_seconds
+    with pytest.raises(FitError, match="see that it converges"):
+        jaxid.bootstrap(fit, 4, progress=False)
+
+
+def test_filters_are_given_for_every_output(recording):
+    with pytest.raises(NoiseError, match="filters for 1 outputs are given, there are 2"):
+        jaxid.fit(jaxid.scara(), recording, jaxid.SeparablePEM(GIVEN, filters=FILTERS[:1]))
+
+
+def test_a_refit_gives_the_error_of_the_values_it_gives(fits):
+    optimum = fits["oem"].optimum
+    lanes = Lanes.around(optimum, 1)
+    signs = (-1.0) ** np.arange(len(optimum.theta))
+    away = np.asarray(optimum.theta) + fits["oem"].std * signs
+    lanes = dataclasses.replace(lanes, theta=jnp.asarray(away)[None])
+    before = ls.point_around(optimum.problem, jnp.asarray(away), jnp.asarray(optimum.start))
+    found = refit(optimum, lanes, steps=0)
+    theta = jnp.asarray(found.theta[0])
+    after = ls.point_around(optimum.problem, theta, jnp.asarray(optimum.start))
+    assert before.loss - after.loss > 4
+    assert abs(found.loss[0] - after.loss) < 0.05 * (before.loss - after.loss)
 
 
 def test_many_fits_tell_how_far_they_are(fits, monkeypatch):

@@ -105,7 +105,9 @@ def discover(
         if search.is_series(steps, say):
             note, steps, removed = _series_note(steps), steps[:1], ()
             verdict, notes, unfinished = "outside_catalogue", (*_notes(steps), note), False
-    if verdict != "outside_catalogue" and steps[-1].fit.status is Status.misfit:
+    # What is outside may well leave more of one joint's signal than there was, but not of all.
+    explained = verdict == "outside_catalogue" and steps[-1].fit.error_percent.min(axis=None) < 99
+    if steps[-1].fit.status is Status.misfit and not explained:
         raise FitError(
             f"neither {loop.name} nor the catalogue explains anything of these recordings: "
             f"{steps[-1].fit.notes[-1]}"

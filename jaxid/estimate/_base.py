@@ -6,7 +6,7 @@ import html
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -15,10 +15,12 @@ import plotly.graph_objects as go
 from jaxtyping import Float
 
 from .. import figures
+from ..errors import FitError
 from ..loop import ClosedLoop
 from ..noise import ARFilter, VectorAR, innovations, ljung_box
 from ..recording import Recording, Recordings
 from ..saved import save
+from ..settings import check_words
 from ..showing import AbstractShown
 
 
@@ -96,6 +98,11 @@ class Fit(AbstractShown):
     def innovations(self) -> tuple[Float[np.ndarray, "_samples joints"], ...]:
         """Residuals through the inverse of the noise filters; zero where the past is not known."""
         noise = self.noise
+        if isinstance(noise, VectorAR) and noise.outputs > self.loop.joints:
+            raise FitError(
+                "a filter of torque and position together has no innovations of torque alone: "
+                "fit one of the two, or without coupled"
+            )
         if noise is not None and not isinstance(noise, VectorAR):
             noise = noise[: self.loop.joints]
         return tuple(innovations(r, noise) for r in self.residuals)
@@ -191,7 +198,16 @@ class Fit(AbstractShown):
 
 
 class AbstractMethod(eqx.Module):
-    """An estimator with its settings."""
+    """An estimator with its settings.
+
+    Class attribute, False by default: `rigid`, of methods that take what the sensors report for
+    the motion of drives and links.
+    """
+
+    rigid: ClassVar[bool] = False
+
+    def __check_init__(self):
+        check_words(self)
 
     @abc.abstractmethod
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:

@@ -4,13 +4,15 @@ import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 
-from ..effects import check_declared
+from ..effects import AbstractEffect, AbstractTransmission, check_declared
 from ..errors import FitError
 from ..loop import ClosedLoop
 from ..recording import Recording, Recordings
-from ..simulate import check_joints
+from ..recording._checks import missing_after
+from ..simulate import check_joints, check_law
 from ._base import AbstractMethod, Fit, Status
 from .oem import OEM
 
@@ -32,12 +34,41 @@ def fit(
     """
     recordings = Recordings.of(recordings)
     check_joints(loop, recordings[0])
+    check_law(loop)
     for effect in loop.effects:
         check_declared(effect, loop.joints)
     method = OEM() if method is None else method
     if not isinstance(method, AbstractMethod):
         raise FitError(f"{method!r} is not a method: give an object such as jaxid.OEM()")
-    return _followed(_doubted(_honest(method.fit(loop, recordings))))
+    if not loop.names:
+        raise FitError(
+            f"{loop.name} has no free parameter to estimate: free one with loop.free(name)"
+        )
+    if method.rigid:
+        _check_rigid(loop, method)
+    found = _followed(_doubted(_honest(method.fit(loop, recordings))))
+    return dataclasses.replace(found, notes=(*found.notes, *_gaps(recordings)))
+
+
+def _check_rigid(loop: ClosedLoop, method: AbstractMethod) -> None:
+    """Refuses what stands between the sensors and the motion that a method takes from them."""
+    for effect in loop.effects:
+        sensor = type(effect).read is not AbstractEffect.read
+        if sensor or isinstance(effect, AbstractTransmission):
+            raise FitError(
+                f"{type(method).__name__} takes what the sensors report for the motion of drive "
+                f"and link, which {effect.effect_name()} sets apart: use OEM, or leave it out"
+            )
+
+
+def _gaps(recordings: Recordings) -> list[str]:
+    """What to say of recordings with stretches of time in which nothing was recorded."""
+    return [
+        f"{r.name} has a gap of {np.diff(r.time).max():.3g} s, across which its reference was "
+        "taken for smooth and its noise for steady: cut it there with Recording.slice"
+        for r in recordings
+        if missing_after(r.time).any()
+    ]
 
 
 def _honest(found: Fit) -> Fit:
@@ -67,13 +98,14 @@ def _doubted(found: Fit) -> Fit:
 
     It is no success where no signal is explained at all, or one is left larger than it was.
     """
-    left = _left_percent(found)
+    errors = found.error_percent * _of_motion(found)
+    left = _left_percent(found, errors)
     settled = found.status in (Status.converged, Status.stalled)
     if settled and (left.min() > 99.0 or left.max() > 105.0):
         found = dataclasses.replace(found, status=Status.misfit)
-    largest = found.error_percent.to_numpy().max(axis=0)
-    errors = {str(c): float(x) for c, x in zip(found.error_percent.columns, largest, strict=True)}
-    worst = {label: value for label, value in errors.items() if value > _DOUBTFUL_PERCENT}
+    largest = errors.to_numpy().max(axis=0)
+    by_joint = {str(c): float(x) for c, x in zip(errors.columns, largest, strict=True)}
+    worst = {label: value for label, value in by_joint.items() if value > _DOUBTFUL_PERCENT}
     if not worst:
         return found
     joints = ", ".join(f"{label} {value:.3g} %" for label, value in worst.items())
@@ -103,9 +135,22 @@ def _followed(found: Fit) -> Fit:
     return dataclasses.replace(found, notes=(*found.notes, note))
 
 
-def _left_percent(found: Fit) -> Float[np.ndarray, " joints"]:
+def _of_motion(found: Fit) -> Float[np.ndarray, "recordings joints"]:
+    """Size of the compared signal over that of what a model has to explain of it.
+
+    Where zero is on an axis says nothing of a model; of joints that hardly move there is no more.
+    """
+    shape = found.error_percent.shape
+    if found.optimum is None or found.optimum.problem.signals[0] != "q":
+        return np.ones(shape)
+    size = np.stack([np.linalg.norm(r.q, axis=0) for r in found.recordings])
+    moved = np.stack([np.linalg.norm(r.q - r.q.mean(axis=0), axis=0) for r in found.recordings])
+    return np.where(moved > 1e-2 * moved.max(), size / np.where(moved > 0, moved, 1.0), 1.0)
+
+
+def _left_percent(found: Fit, percent: pd.DataFrame) -> Float[np.ndarray, " joints"]:
     """Relative error of each joint over all recordings; of a signal that is nil there is none."""
-    errors = found.error_percent.to_numpy()
+    errors = percent.to_numpy()
     left = np.array([np.linalg.norm(r, axis=0) for r in found.residuals])
     with np.errstate(divide="ignore", invalid="ignore"):
         size = np.where(errors > 0, left / errors, 0.0)

@@ -40,6 +40,8 @@ class Filtering(eqx.Module):
 
         **Raises:** `FitError` for a cutoff above the Nyquist rate, or too few samples.
         """
+        if min(x for x in (self.cutoff, self.rate, self.order, 1) if x is not None) <= 0:
+            raise FitError(f"{self!r}: give a cutoff, a rate and an order above zero")
         cutoff = self.cutoff or signal_cutoff(recording)
         if cutoff >= recording.rate / 2:
             raise FitError(
@@ -72,8 +74,16 @@ def filtered(recording: Recording, filtering: Filtering) -> Simulated:
 
 
 def linear_parameters(loop: ClosedLoop) -> tuple[Parameter, ...]:
-    """The free parameters in which torque is linear."""
-    return tuple(p for p in loop.free_parameters if p.declaration.linear)
+    """The free parameters in which torque is linear.
+
+    **Raises:** `FitError` where there are none.
+    """
+    found = tuple(p for p in loop.free_parameters if p.declaration.linear)
+    if not found:
+        raise FitError(
+            f"{loop.name} has no free parameter in which torque is linear: use OEM, or free one"
+        )
+    return found
 
 
 def effect_states(

@@ -17,6 +17,7 @@ from ..loop import ClosedLoop, effect_loads
 from ..parameters import Bounds, list_parameters, read_values, write_values
 from ..recording import Recording, Recordings
 from ..simulate import Simulated, recording_label
+from ..smoothing import evened
 from ._base import AbstractMethod, Fit, determined_covariance
 from ._encoder import Kernels, errors_of, row_errors, solve_weighted
 from ._operators import Operator
@@ -213,7 +214,9 @@ def fit_rows(
                     f"{recording.name} does not say what one encoder count is: give resolution= "
                     "when it is read, or use weights='joint'"
                 )
-    rows = [rows_of(recording) for recording in recordings]
+    # Operators, differences and series are those of even samples.
+    even = Recordings.of([evened(recording) for recording in recordings])
+    rows = [rows_of(recording) for recording in even]
     chosen = linear_parameters(loop)
     names = tuple(name for p in chosen for name in p.names)
     scales = np.asarray(Bounds.of(chosen).scale)
@@ -229,7 +232,7 @@ def fit_rows(
         solved = _coloured(stacked, solved, names)
         how = "sandwich estimate for coloured residuals"
     else:
-        solved = _weighted(loop, recordings, rows, stacked, solved, names)
+        solved = _weighted(loop, even, rows, stacked, solved, names)
         how = "covariance of the encoder's errors, Q²/12 through every operator"
     fit = regression_fit(loop, recordings, method, stacked, solved, started)
     return dataclasses.replace(fit, deviations=how)

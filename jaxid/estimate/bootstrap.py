@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from .. import figures
 from ..errors import FitError
-from ..noise import ARFilter, VectorAR, fit_ar
+from ..noise import ARFilter, VectorAR, fit_ar, innovations, levels
 from ..progress import working
 from ..showing import AbstractShown
 from ._base import Fit
@@ -91,15 +91,18 @@ def bootstrap(fit: Fit, draws: int = 200, *, seed: int = 0, progress: bool = Tru
     **Raises:** `FitError` for a fit by regression, with `Tracking()`, or that did not succeed.
     """
     problem = optimum_of(fit, "bootstrap").problem
-    if not np.isfinite(fit.theta).all() or not np.isfinite(problem.weights).all():
-        raise FitError("a fit that diverged has no bootstrap: start it from other values")
+    if not fit.succeeded or not np.isfinite(problem.weights).all():
+        raise FitError(f"a fit that {fit.status.value} has no bootstrap: see that it converges")
+    if draws < 2:
+        raise FitError(f"{draws} draws have no deviation: give 2 or more, 200 for intervals")
     noise = fit.noise
     if noise is None:
         noise = residual_filters(fit)
     lengths = [len(r) for r in fit.residuals]
     if len(lengths) != problem.batch.q.shape[0]:
         raise FitError("bootstrap is for whole recordings: fit without window")
-    made = drawn_noise(noise, lengths, draws, np.random.default_rng(seed))
+    strengths = levels([innovations(r, noise) for r in fit.residuals])
+    made = drawn_noise(noise, lengths, draws, np.random.default_rng(seed), strengths)
     with working(f"bootstrap of {fit.loop.name}", progress) as say:
         found = refit_signals(fit, redrawn(fit, made), say=say)
     p = len(fit.names)

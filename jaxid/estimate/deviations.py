@@ -218,6 +218,8 @@ def with_deviations(fit: Fit, kind: Deviations) -> Fit:
 
     **Raises:** `FitError` for a fit by regression.
     """
+    if kind not in SAID:
+        raise FitError(f"there are no deviations of kind {kind!r}: {', '.join(map(repr, SAID))}")
     optimum = optimum_of(fit, "deviations of that kind")
     covariance, lost = covariance_of(optimum, kind, fit.noise)
     return dataclasses.replace(fit, covariance=covariance, undetermined=lost, deviations=SAID[kind])

@@ -60,6 +60,7 @@ class _Iterated(AbstractMethod):
     weights: eqx.AbstractVar[Weights]
     tolerance: eqx.AbstractVar[float]
     max_steps: eqx.AbstractVar[int]
+    rigid = True
 
     def solve_once(
         self, loop: ClosedLoop, recordings: Recordings, motions: list[Simulated]

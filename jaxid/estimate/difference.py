@@ -24,6 +24,7 @@ class DifferenceLS(AbstractMethod):
 
     states: AbstractStates = Differences()
     weights: EncoderWeights = eqx.field(static=True, default="joint")
+    rigid = True
 
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
         """Estimates the parameters in which torque is linear; called by `jaxid.fit`."""

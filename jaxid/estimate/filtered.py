@@ -31,6 +31,7 @@ class FilteredLS(AbstractMethod):
     )
     states: AbstractStates = LowPass()
     weights: EncoderWeights = eqx.field(static=True, default="joint")
+    rigid = True
 
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
         """Estimates the parameters in which torque is linear; called by `jaxid.fit`."""

@@ -27,6 +27,7 @@ class FourierLS(AbstractMethod):
     period: float | None = eqx.field(static=True, default=None)
     harmonics: int | None = eqx.field(static=True, default=None)
     weights: EncoderWeights = eqx.field(static=True, default="joint")
+    rigid = True
 
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
         """Estimates the parameters in which torque is linear; called by `jaxid.fit`."""

@@ -1,6 +1,7 @@
 """IDIM-LS: least squares on the inverse dynamic model."""
 
 import time
+from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
@@ -10,7 +11,7 @@ from jaxtyping import Float
 
 from ..errors import FitError
 from ..loop import ClosedLoop
-from ..parameters import Bounds, write_values
+from ..parameters import Bounds, Parameter, write_values
 from ..recording import Recordings
 from ._base import AbstractMethod, Fit, Status, determined_covariance, relative_errors
 from ._regression import Filtering, decimator, filtered, linear_parameters, regression
@@ -135,6 +136,7 @@ def regression_fit(
     notes = []
     if shaped:
         notes.append(f"{', '.join(shaped)} stayed as given: torque is not linear in them")
+    notes += _beyond_bounds(chosen, solved.theta)
     if float(_smallest_inertia(fitted.arm)) <= 0:
         notes.append("these values are not physical: the mass matrix is not positive definite")
         status = Status.unphysical if status is Status.converged else status
@@ -157,6 +159,17 @@ def regression_fit(
     )
 
 
+def _beyond_bounds(chosen: Sequence[Parameter], theta: Float[np.ndarray, " p"]) -> list[str]:
+    """What to say of values that a regression, which knows no bounds, put outside them."""
+    bounds = Bounds.of(chosen)
+    low, high = (np.asarray(x) for x in (bounds.lower, bounds.upper))
+    names = [name for p in chosen for name in p.names]
+    outside = [n for n, out in zip(names, (theta < low) | (theta > high), strict=True) if out]
+    if not outside:
+        return []
+    return [f"{', '.join(outside)} outside the declared bounds, which a regression does not know"]
+
+
 _smallest_inertia = eqx.filter_jit(lambda arm: arm.smallest_inertia())
 
 
@@ -171,6 +184,7 @@ class IDIM(AbstractMethod):
     - `weights`: `"ordinary"`, `"joint"` (each joint by its own deviation) or `"robust"` (Huber).
     """
 
+    rigid = True
     filtering: Filtering = Filtering()
     weights: Weights = eqx.field(static=True, default="joint")
 

@@ -68,12 +68,13 @@ class JointPEM(AbstractMethod):
         """Estimates the loop's free parameters; called by `jaxid.fit`."""
         started = time.perf_counter()
         recordings.common_period()
+        deadline = started + self.oem.max_seconds
         with working(f"JointPEM of {loop.name}", self.oem.progress) as say:
             loop = with_substeps(start_values(loop, recordings, self.oem.start, say), recordings)
-            orders, noise, first = self._orders(loop, recordings, say)
+            orders, noise, first = self._orders(loop, recordings, say, deadline)
             if first is not None:
                 loop = first.loop
-            done = _converge_jointly(self, loop, recordings, orders, noise, say)
+            done = _converge_jointly(self, loop, recordings, orders, noise, say, deadline)
         total = done.iterations + (0 if first is None else first.iterations)
         done = dataclasses.replace(done, iterations=total)
         method = dataclasses.replace(self.oem, deviations=self.deviations)
@@ -81,12 +82,16 @@ class JointPEM(AbstractMethod):
         return _report(method, done, recordings, seconds, self, estimated_noise(done))
 
     def _orders(
-        self, loop: ClosedLoop, recordings: Recordings, say: Callable[[str], None]
+        self,
+        loop: ClosedLoop,
+        recordings: Recordings,
+        say: Callable[[str], None],
+        deadline: float,
     ) -> tuple[Sequence[int], Noise, _Done | None]:
         """Orders, and filters and fit to start from where orders were not given."""
         if self.orders is not None:
             return self.orders, None, None
-        first = _converge(self.oem, loop, recordings, say)
+        first = _converge(self.oem, loop, recordings, say, deadline=deadline)
         with keeping(first, self.oem, recordings):
             order = Order(self.criterion, self.highest, self.white)
             noise = noise_filters(first, order, None, self.coupled)
@@ -102,6 +107,7 @@ def _converge_jointly(
     orders: Sequence[int],
     noise: Noise,
     say: Callable[[str], None],
+    deadline: float,
 ) -> _Done:
     """Minimises, then again with the noise covariance that follows, until that settles.
 
@@ -133,10 +139,11 @@ def _converge_jointly(
     total, worth = 0, 1e-2
     while True:
         left = oem.max_steps - total
-        minimum = minimise(problem, theta, start, oem.tolerance, worth, left, say)
+        minimum = minimise(problem, theta, start, oem.tolerance, worth, left, say, deadline)
         total += minimum.iterations
         theta, start = minimum.point.theta, minimum.point.start
-        if minimum.status is Status.diverged or total >= oem.max_steps:
+        ended = minimum.status in (Status.diverged, Status.max_seconds)
+        if ended or total >= oem.max_steps:
             break
         mix = _new_mix(problem, minimum)
         change = np.abs(mix @ np.linalg.inv(np.asarray(problem.mix)) - np.eye(outputs)).max()

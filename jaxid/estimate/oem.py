@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
-from ..control import OpenLoop
+from ..control import OpenLoop, Reading
 from ..errors import FitError, JaxidError
 from ..loop import ClosedLoop
 from ..noise import ARFilter, Noise, VectorAR
@@ -86,10 +87,6 @@ class OEM(AbstractMethod):
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
         """Estimates the loop's free parameters; called by `jaxid.fit`."""
         started = time.perf_counter()
-        if not loop.names:
-            raise FitError(
-                f"{loop.name} has no free parameter to estimate: free one with loop.free(name)"
-            )
         # What does not fit together is said before the work, not after it.
         _signals(self, loop)
         prepare(loop, pieces_of(recordings, self.window))
@@ -109,7 +106,21 @@ class OEM(AbstractMethod):
                     self, finer_loop, kept, say, deadline=deadline, weights=done.weights
                 )
         found = _report(self, done, kept, time.perf_counter() - started)
-        return dataclasses.replace(found, notes=(*found.notes, *_left_out(recordings, kept)))
+        more = (*_left_out(recordings, kept), *self._forgotten(loop))
+        return dataclasses.replace(found, notes=(*found.notes, *more))
+
+    def _forgotten(self, loop: ClosedLoop) -> list[str]:
+        """What to say of states that windows do not hand on; only positions and velocities are."""
+        if self.window is None:
+            return []
+        zeros = jnp.zeros(loop.joints)
+        own = [e.effect_name() for e in loop.effects if e.initial_state().size]
+        law = loop.controller.initial_state(Reading(zeros, zeros))
+        own += [type(loop.controller).__name__] if sum(x.size for x in jax.tree.leaves(law)) else []
+        if not own:
+            return []
+        said = "every window begins with the states of {} at rest, by which values may be off"
+        return [f"{said.format(', '.join(own))}: see whether they stay without window"]
 
     def _from_start(
         self,
@@ -480,19 +491,15 @@ def _report(
 
 
 def _rejoin(recordings, pieces, measured, errors):
-    """Windows put together again, one entry for each recording."""
+    """Windows put together again by recording; a sample that two share is kept once."""
     if len(pieces) == len(recordings):
         return measured, errors
-    owner = [piece.name for piece in pieces]
-    together = []
-    for values in (measured, errors):
-        together.append(
-            [
-                np.concatenate([x for x, name in zip(values, owner, strict=True) if name == r.name])
-                for r in recordings
-            ]
-        )
-    return together
+
+    def together(values, name):
+        own = [x for x, piece in zip(values, pieces, strict=True) if piece.name == name]
+        return np.concatenate([own[0], *(x[1:] for x in own[1:])])
+
+    return [[together(values, r.name) for r in recordings] for values in (measured, errors)]
 
 
 def _at_bounds(loop: ClosedLoop) -> list[str]:

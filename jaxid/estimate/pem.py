@@ -20,13 +20,14 @@ from ..noise import (
     fit_ar,
     fit_var,
     innovations,
+    levels,
 )
 from ..progress import working
 from ..recording import Recordings
 from ..simulate import with_substeps
 from ._base import AbstractMethod, Fit, Status
 from .deviations import Deviations
-from .oem import OEM, _converge, _Done, _report, start_values
+from .oem import OEM, _converge, _Done, _report, _signals, start_values
 
 
 class Order(NamedTuple):
@@ -55,7 +56,7 @@ class SeparablePEM(AbstractMethod):
     - `first_step`: `"filtered"` for parameters from the filtered error; `"plain"` for the paper's
       own variant, whose parameters ignore the filter and stay those of output error.
     - `deviations`: `"white"` for (A.1), `"sandwich"`, `"paper"`; by default the first where
-      parameters come from the filtered error, else the second.
+      parameters come from the filtered error and all recordings are as noisy, else the second.
     - `tolerance`: relative change of the prediction error's variance at which it stops.
     - `rounds`: largest number of alternations.
 
@@ -89,10 +90,16 @@ class SeparablePEM(AbstractMethod):
             loop = with_substeps(start_values(loop, recordings, self.oem.start, say), recordings)
             deadline = started + self.oem.max_seconds
             done, noise, rounds = self._alternate(loop, recordings, say, deadline)
-        kind = self.deviations or ("white" if self.first_step == "filtered" else "sandwich")
+        kind = self.deviations or self._deviations(done, noise)
         method = dataclasses.replace(self.oem, deviations=kind)
         seconds = time.perf_counter() - started
         return _report(method, done, recordings, seconds, self, noise, rounds)
+
+    def _deviations(self, done: _Done, noise: Noise) -> Deviations:
+        """(A.1) knows one level of noise: the other where recordings differ by more than chance."""
+        ratios = np.stack(levels([innovations(x, noise) for x in residual_series(done)]))
+        uneven = np.any(ratios.max(axis=0) > 1.3 * ratios.min(axis=0))
+        return "sandwich" if uneven or self.first_step == "plain" else "white"
 
     def _alternate(
         self,
@@ -103,6 +110,11 @@ class SeparablePEM(AbstractMethod):
     ) -> tuple[_Done, Noise, int]:
         """Where it ended, with which filters, after how many alternations."""
         if self.filters is not None:
+            outputs = len(_signals(self.oem, loop)) * loop.joints
+            given = self.filters
+            count = given.outputs if isinstance(given, VectorAR) else len(given)
+            if count != outputs:
+                raise NoiseError(f"filters for {count} outputs are given, there are {outputs}")
             done = _converge(self.oem, loop, recordings, say, self.filters, deadline)
             return done, self.filters, 0
         done = _converge(self.oem, loop, recordings, say, deadline=deadline)

@@ -180,6 +180,18 @@ def _own_columns(problem: Problem, point: Point) -> Float[Array, "recordings sam
     return own - past @ solve(gram, cross)
 
 
+def _changed(
+    found: Sensitivity,
+    step: Float[Array, " parameters"],
+    moved: Float[Array, "recordings initials"],
+) -> Float[Array, "recordings samples outputs"]:
+    """What steps of parameters and initial states add to the residual."""
+    change = found.jacobian @ step
+    return (
+        change if found.start is None else change + jnp.einsum("rkoa,ra->rko", found.start, moved)
+    )
+
+
 @eqx.filter_jit
 def _refit_some(optimum: Optimum, lanes: Lanes, steps: int) -> Refitted:
     problem, start = optimum.problem, jnp.asarray(optimum.start)
@@ -198,12 +210,12 @@ def _refit_some(optimum: Optimum, lanes: Lanes, steps: int) -> Refitted:
         theta, initials = _settle(mine, near, lane.theta, start, steps)
         point = point_around(mine, theta, initials)
         low, high = mine.lower - theta, mine.upper - theta
-        step, _, promise = _bounded_step(point, low, high, jnp.zeros(()))
+        step, moved, promise = _bounded_step(point, low, high, jnp.zeros(()))
         found = point.found
         last = promise / (point.loss / jnp.sum(found.residual != 0))
         columns = _own_columns(mine, point)
-        residual = found.residual - found.jacobian @ step
-        raw = found.raw + near.jacobian @ -step[:own]
+        residual = found.residual + _changed(found, step, moved)
+        raw = found.raw + _changed(near, step[:own], moved)
         return Refitted(theta + step, jnp.sum(residual**2), last, raw, residual, columns)
 
     return jax.vmap(one)(lanes)
@@ -315,8 +327,11 @@ def drawn_noise(
     lengths: Sequence[int],
     draws: int,
     rng: np.random.Generator,
+    strengths: Sequence[Float[np.ndarray, " outputs"]] | None = None,
 ) -> list[Float[np.ndarray, "draws _samples outputs"]]:
-    """Stationary noise of a filter, for recordings of these lengths."""
+    """Stationary noise of a filter, for recordings of these lengths, each with its strength."""
     if isinstance(noise, VectorAR):
-        return [noise.simulate((draws, n), rng) for n in lengths]
-    return [np.stack([f.simulate((draws, n), rng) for f in noise], axis=-1) for n in lengths]
+        made = [noise.simulate((draws, n), rng) for n in lengths]
+    else:
+        made = [np.stack([f.simulate((draws, n), rng) for f in noise], axis=-1) for n in lengths]
+    return made if strengths is None else [x * k for x, k in zip(made, strengths, strict=True)]

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from ..fourier import Harmonics, fourier_basis, period_of, settle_harmonics
 from ..recording import Recording
+from ..settings import check_words
 from ..simulate import Simulated
 from ..smoothing import even_times, low_pass, resampled
 from ._regression import Filtering
@@ -22,6 +23,9 @@ Rates = tuple[
 
 class AbstractStates(eqx.Module):
     """How position, velocity and acceleration follow from recorded positions: linearly."""
+
+    def __check_init__(self):
+        check_words(self)
 
     @abc.abstractmethod
     def rates(self, recording: Recording, x: Float[np.ndarray, "samples columns"]) -> Rates:

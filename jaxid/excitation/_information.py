@@ -1,5 +1,6 @@
 """What a reference would tell about the parameters: information matrices, differentiable."""
 
+import dataclasses
 from typing import Literal
 
 import equinox as eqx
@@ -8,30 +9,50 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..effects import Motion
+from ..effects import AbstractEffect, Motion
 from ..estimate._regression import linear_parameters, mismatch
 from ..loop import ClosedLoop
 from ..parameters import Parameter, read_values, write_values
+from ..settings import check_words
 from ..simulate import NOBODY, Interval, initial, run_with_sensitivities
 
 Kind = Literal["inverse-dynamics", "closed-loop"]
 Criterion = Literal["determinant", "deviation", "condition"]
 
 
-def along(time: Float[Array, " points"], signals: Float[Array, "3 points joints"]) -> Motion:
-    """Position, velocity and acceleration as effects see them, without torque."""
+def along(
+    time: Float[Array, " points"],
+    signals: Float[Array, "3 points joints"],
+    tau: Float[Array, "points joints"],
+) -> Motion:
+    """Position, velocity, acceleration and commanded torque as effects see them."""
     n = time.shape[0]
     q, v, a = signals
-    zero = jnp.zeros_like(q)
-    return jax.vmap(Motion)(time, q, v, a, zero, jnp.zeros((n, 0)), jnp.full(n, NOBODY))
+    return jax.vmap(Motion)(time, q, v, a, tau, jnp.zeros((n, 0)), jnp.full(n, NOBODY))
 
 
 @eqx.filter_jit
 def torque_along(
     loop: ClosedLoop, time: Float[Array, " points"], signals: Float[Array, "3 points joints"]
 ) -> Float[Array, "points joints"]:
-    """Torque that a motion takes."""
-    return mismatch(loop, along(time, signals))
+    """Torque that is to be commanded for a motion; drives that lag are taken to follow at once."""
+    acting = [type(e).command is not AbstractEffect.command for e in loop.effects]
+    lags = [on and e.initial_state().size for e, on in zip(loop.effects, acting, strict=True)]
+    prompt = [e for e, late in zip(loop.effects, lags, strict=True) if not late]
+    loop = dataclasses.replace(loop, effects=prompt)
+
+    def lacking(tau):
+        return mismatch(loop, along(time, signals, tau))
+
+    tau = jnp.zeros_like(signals[0])
+    if not any(acting) and not any(e.loaded for e in prompt):
+        return lacking(tau)
+    # What drives do with a command, and friction that grows with it, are all but affine in it:
+    # a few steps of Newton's method.
+    for _ in range(4):
+        missing, slope = jax.jvp(lacking, (tau,), (jnp.ones_like(tau),))
+        tau = tau - missing / jnp.minimum(slope, -0.1)
+    return tau
 
 
 def chosen_parameters(loop: ClosedLoop, kind: Kind) -> tuple[Parameter, ...]:
@@ -43,11 +64,12 @@ def chosen_parameters(loop: ClosedLoop, kind: Kind) -> tuple[Parameter, ...]:
 def inverse_columns(
     loop: ClosedLoop, time: Float[Array, " points"], signals: Float[Array, "3 points joints"]
 ) -> Float[Array, "points joints parameters"]:
-    """The inverse-dynamics regressor along a motion."""
+    """The inverse-dynamics regressor along a motion and the torque that it takes."""
     chosen = linear_parameters(loop)
+    at = along(time, signals, torque_along(loop, time, signals))
 
     def torque(values):
-        return torque_along(write_values(loop, chosen, values), time, signals)
+        return mismatch(write_values(loop, chosen, values), at)
 
     return jax.jacfwd(torque)(read_values(loop, chosen))
 
@@ -153,6 +175,9 @@ class Settings(eqx.Module):
     criterion: Criterion = eqx.field(static=True)
     noise: Float[np.ndarray, " joints"]
     scales: Float[np.ndarray, " parameters"]
+
+    def __check_init__(self):
+        check_words(self)
 
     def judge(self, information: Float[Array, "parameters parameters"]) -> Float[Array, ""]:
         """The criterion, to be made small."""

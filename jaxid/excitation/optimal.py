@@ -152,7 +152,8 @@ class Excitation(AbstractShown):
     - `series`: the reference as a Fourier series; `reference()` samples it.
     - `std`: predicted standard deviations of the parameters `names`, for one period and the torque
       noise that was assumed.
-    - `margins`: by limit and joint, how much of it is left, in percent; none is negative.
+    - `margins`: by limit and joint, how much of it is left, in percent; of the workspace what
+      its function leaves, as a rule m; none is negative.
     - `score`: logarithm of the criterion, parameters in units of their scales; of the determinant
       the root that makes it a deviation.
     """
@@ -209,7 +210,7 @@ class Excitation(AbstractShown):
             self._head(),
             self.table().to_string(float_format=lambda x: f"{x:.3g}"),
             "left of the limits, %:",
-            self.margins.to_string(float_format=lambda x: f"{x:.1f}"),
+            self.margins.to_string(float_format=lambda x: f"{x:.3g}"),
         ]
         return "\n".join([*lines, *self.undetermined])
 
@@ -218,7 +219,7 @@ class Excitation(AbstractShown):
         return (
             f"<p>{html.escape(self._head())}</p>"
             f"{self.table().to_html(float_format=lambda x: f'{x:.3g}')}"
-            f"<p>left of the limits, %</p>{self.margins.to_html(float_format='%.1f')}{foot}"
+            f"<p>left of the limits, %</p>{self.margins.to_html(float_format='%.3g')}{foot}"
         )
 
     def _head(self) -> str:
@@ -228,7 +229,15 @@ class Excitation(AbstractShown):
         )
 
 
-def _check(loop: ClosedLoop, limits: Limits, period: float, harmonics: int, rate: float) -> None:
+def _check(
+    loop: ClosedLoop,
+    limits: Limits,
+    period: float,
+    harmonics: int,
+    rate: float,
+    noise: Sequence[float] | np.ndarray | None = None,
+    start: Sequence[float] | np.ndarray | None = None,
+) -> None:
     if len(limits.low) != loop.joints:
         raise LimitsError(
             f"limits are given for {len(limits.low)} joints, but {loop.name} has {loop.joints}"
@@ -243,6 +252,9 @@ def _check(loop: ClosedLoop, limits: Limits, period: float, harmonics: int, rate
             f"{harmonics} harmonics of {period:g} s reach {harmonics / period:.3g} Hz, more than a "
             f"quarter of the sample rate of {rate:g} Hz: take fewer, or a longer period"
         )
+    wrong = [x for x in (noise, start) if x is not None and np.ndim(x) and len(x) != loop.joints]
+    if wrong:
+        raise FitError(f"{len(wrong[0])} values are given for {loop.joints} joints: give one each")
     own = loop.controller.period
     if own is not None and abs(own * rate - 1) > 1e-6:
         raise FitError(f"the controller ticks every {own:g} s: design at its rate, {1 / own:g} Hz")
@@ -325,7 +337,7 @@ def make_design(
 
     Arguments are those of `optimal_excitation`.
     """
-    _check(loop, limits, period, harmonics, rate)
+    _check(loop, limits, period, harmonics, rate, noise, start)
     if not chosen_parameters(loop, kind):
         raise FitError(f"{loop.name} has no free parameter to determine: free one with loop.free")
     pose = pose_within(loop, limits, None if start is None else np.asarray(start, float))
@@ -664,6 +676,7 @@ def _margin_table(design: Design, smallest: Float[np.ndarray, " kinds"]) -> pd.D
         table[kind] = np.minimum(table[kind], row) if kind in table else row
     frame = pd.DataFrame(table, index=[f"joint {j}" for j in range(1, joints + 1)]).T * 100
     if len(smallest) > 8 * joints:
-        frame.loc["workspace"] = np.nan
-        frame.iloc[-1, 0] = smallest[8 * joints :].min() * 100
+        # A function that a user gave, in whatever unit.
+        frame.loc["workspace, in its unit"] = np.nan
+        frame.iloc[-1, 0] = smallest[8 * joints :].min()
     return frame.rename_axis("limit")

@@ -10,7 +10,7 @@ import scipy
 from jaxtyping import Float
 
 from ..errors import NoiseError
-from .whiteness import ljung_box
+from .whiteness import levelled, ljung_box
 
 Criterion = Literal["aic", "aicc", "bic"]
 
@@ -235,8 +235,8 @@ class Burg(eqx.Module):
 
     @classmethod
     def of(cls, series: Sequence[Float[np.ndarray, " _"]], most: int) -> "Burg":
-        """Orders 0..`most`."""
-        forward = [np.asarray(x, dtype=float) for x in series]
+        """Orders 0..`most`, each recording in units of its own level."""
+        forward = levelled([np.asarray(x, dtype=float) for x in series])
         backward = list(forward)
         a = np.ones(1)
         count = sum(len(x) for x in forward)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ..errors import NoiseError
 from .ar import ARFilter, Criterion, check_series, choose
+from .whiteness import levelled
 
 
 class VectorAR(eqx.Module):
@@ -115,7 +116,7 @@ def fit_var(
 
     **Raises:** `NoiseError` where the data do not allow it.
     """
-    series = [np.asarray(x, float) for x in series]
+    series = levelled([np.asarray(x, float) for x in series])
     n = series[0].shape[1]
     for output in range(n):
         check_series([x[:, output] for x in series], order or 0, f"joint {output + 1}")

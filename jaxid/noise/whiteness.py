@@ -26,6 +26,26 @@ def autocovariance(
     return total / sum(len(x) for x in series)
 
 
+def levelled(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]:
+    """Several series with the noise of each as strong as that of all together.
+
+    One recording that is louder than the others would otherwise stand for all of them.
+
+    **Arguments:**
+
+    - `series`: residuals with mean zero, `(samples,)` or `(samples, outputs)` each.
+    """
+    return [x / ratio for x, ratio in zip(series, levels(series), strict=True)]
+
+
+def levels(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]:
+    """How strong the noise of each series is beside that of all together; one where it has none."""
+    power = [np.asarray(np.mean(np.square(x), axis=0)) for x in series]
+    pooled = sum(len(x) * p for x, p in zip(series, power, strict=True)) / sum(map(len, series))
+    ratio = [np.where(p > 0, p, 1.0) / np.where(p > 0, pooled, 1.0) for p in power]
+    return [np.asarray(np.sqrt(r)) for r in ratio]
+
+
 def autocorrelation(
     series: Sequence[Float[np.ndarray, " _"]], lags: int = 38
 ) -> tuple[Float[np.ndarray, " lags_and_zero"], float]:
@@ -56,7 +76,7 @@ def ljung_box(
     """Whether residuals are white, over several recordings at once (Ljung and Box 1978).
 
     statsmodels has the test for one series; pooled, each lag counts the pairs that recordings
-    hold, none across their ends.
+    hold, none across their ends, and each recording in units of its own level.
 
     **Arguments:**
 
@@ -64,7 +84,7 @@ def ljung_box(
     - `lags`: how many.
     - `fitted`: coefficients that were estimated from them.
     """
-    covariance = autocovariance(series, lags)
+    covariance = autocovariance(levelled(series), lags)
     total = sum(len(x) for x in series)
     if covariance[0] <= 0:
         return LjungBox(0.0, max(lags - fitted, 1), 1.0)

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from ..errors import JaxidWarning
 from ._problem import brief, problem
@@ -214,9 +214,7 @@ def _increasing(
         )
     if not np.isfinite(span):
         raise problem(source, f"{label} spans more than float64 can hold", "give it in seconds")
-    # Uneven sampling has many long steps and a gap is a rare one: five times the median would
-    # take the first for the second, five times the 95th percentile is the same where time is even.
-    too_long = steps / 5 > np.quantile(steps, 0.95, method="lower")
+    too_long = missing_after(time)
     if gaps != "allow" and too_long.any():
         row = int(np.argmax(too_long))
         raise problem(
@@ -225,6 +223,16 @@ def _increasing(
             f"is {np.median(steps):.4g} s",
             'split the recording there or pass gaps="allow"',
         )
+
+
+def missing_after(time: Float64[np.ndarray, " samples"]) -> Bool[np.ndarray, " steps"]:
+    """After which samples there is a gap.
+
+    Uneven sampling has many long steps and a gap is a rare one: five times the median would take
+    the first for the second, five times the 95th percentile is the same where time is even.
+    """
+    steps = np.diff(time)
+    return steps / 5 > np.quantile(steps, 0.95, method="lower")
 
 
 def _moving(
