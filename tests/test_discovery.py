@@ -351,6 +351,37 @@ def test_contact_is_free_from_the_start_in_some_refits(offset_case, offset_story
 
 
 @pytest.mark.xdist_group("offset")
+def test_backlash_is_tried_where_an_elasticity_leads(offset_case, offset_story, monkeypatch):
+    search, start = search_of(offset_case), offset_story[0].steps[0]
+    tried = []
+
+    def fit(loop, recordings, method):
+        tried.append(loop)
+        return dataclasses.replace(start.fit, loop=loop)
+
+    monkeypatch.setattr(sys.modules["jaxid.discovery.discover"], "fit", fit)
+    monkeypatch.setattr(_Search, "criterion", lambda self, fit, _: 3.0)
+    soft = JointElasticity(joint=2, compliance=0.02, rotor=0.03)
+    leading = Contender(
+        "joint_elasticity", 2, dataclasses.replace(start.fit, loop=start.fit.loop.add(soft)), 5.0
+    )
+    found = search.with_siblings([leading], start, silent)
+    assert [(c.name, c.joint) for c in found] == [("backlash", 2), ("joint_elasticity", 2)]
+    gap = tried[0].effects[-1]
+    load = np.std(np.concatenate([r.tau[:, 1] for r in search.recordings]))
+    assert float(gap.gap) == pytest.approx(2 * 0.02 * load)
+    assert float(gap.rotor) == 0.03
+    assert float(gap.stiffness) == pytest.approx(50.0)
+    assert "kc2" in tried[0].names
+    # Not of a backlash, and not of what is no transmission.
+    of = {v.key: v.hypothesis.effect for v in start.diagnosis.ranking}
+    for name in ("backlash", "spring"):
+        loop = start.fit.loop.add(of[name, 2])
+        other = Contender(name, 2, dataclasses.replace(start.fit, loop=loop), 5.0)
+        assert search.with_siblings([other], start, silent) == [other]
+
+
+@pytest.mark.xdist_group("offset")
 def test_effect_is_added_twice_at_the_most(offset_story):
     start = offset_story[0].steps[0]
     top = next(v for v in start.diagnosis.ranking if v.possible and v.evidence > 0)

@@ -7,6 +7,7 @@ from functools import cache
 import diffrax
 import equinox as eqx
 import independent as sim
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -320,6 +321,31 @@ def test_slow_drive_starts_settled(effect):
     run = simulated(loop, jaxid.Recording(time, q, 0 * q, q_ref=q_ref, v=0 * q))
     np.testing.assert_allclose(run.q, q, atol=1e-9)
     np.testing.assert_allclose(run.delivered[0], needed, rtol=1e-9)
+
+
+def test_delay_is_late_by_its_delay_at_all_frequencies_of_motion():
+    """The transfer function of its linear equations beside that of a pure dead time."""
+    delay = 0.03
+    effect = TimeDelay(joint=1, delay=delay)
+
+    def motion(state, tau):
+        zero = jnp.zeros(1)
+        return Motion(jnp.zeros(()), zero, zero, zero, tau[None], state, jnp.asarray(0))
+
+    def rate(state, tau):
+        return effect.derivative(motion(state, tau))
+
+    def out(state, tau):
+        return effect.command(motion(state, tau))[0]
+
+    at = (jnp.zeros(3), jnp.zeros(()))
+    a, b = (np.asarray(jax.jacobian(rate, k)(*at)) for k in (0, 1))
+    c, d = (np.asarray(jax.jacobian(out, k)(*at)) for k in (0, 1))
+    assert d == 0
+    for angle in (0.1, 0.5, 1.0, 2.0):
+        s = 1j * angle / delay
+        response = c @ np.linalg.solve(s * np.eye(3) - a, b)
+        assert abs(response - np.exp(-1j * angle)) < 1.4e-4 * angle**6 + 1e-12
 
 
 # --- nothing is nothing -----------------------------------------------------------------------

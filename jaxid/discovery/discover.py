@@ -197,6 +197,7 @@ class _Search(eqx.Module):
         if outside and not self.convinces(contenders, last):
             contenders = self.second_thoughts(contenders, entries, last, say)
         if self.convinces(contenders, last):
+            contenders = self.with_siblings(contenders, last, say)
             return None, (self.grown(last, contenders, say),)
         if outside and len(steps) < most and (further := self.detour(steps, contenders, say)):
             return None, further
@@ -359,6 +360,34 @@ class _Search(eqx.Module):
                 if np.isfinite(value):
                     tried.append(Contender(*verdict.key, refitted, value))
             found += sorted(tried, key=_criterion)[:1]
+        return sorted(found, key=_criterion)
+
+    def with_siblings(
+        self, contenders: Sequence[Contender], last: Step, say: Callable[[str], None]
+    ) -> list[Contender]:
+        """Contenders, and beside a transmission that leads the others that come close to it.
+
+        To a small motion a gap of micrometres is a soft spring, and that is what screening finds:
+        a refit that begins with a gap as wide as the spring's twist tells which of the two it is.
+        """
+        loop, found = contenders[0].fit.loop, list(contenders)
+        leading = loop.effects[-1]
+        if not isinstance(leading, AbstractTransmission):
+            return found
+        tau = np.concatenate([r.tau[:, leading.joint - 1] for r in self.recordings])
+        for verdict in _transmissions_on(last.diagnosis, leading.joint):
+            other = verdict.hypothesis.effect.after(leading, float(np.std(tau)))  # type: ignore[attr-defined]
+            if other is None or any(verdict.key == (c.name, c.joint) for c in found):
+                continue
+            say(f"refit with {effect_on(*verdict.key)} in its place")
+            instead = loop.with_effects((*loop.effects[:-1], other))
+            instead = instead.free(*_held_shapes(instead))
+            plain = dataclasses.replace(_quiet(self.method), start="given")
+            rough = fit(instead, self.recordings, plain)
+            close = fit(rough.loop, self.recordings, self.whitened_method(last.diagnosis))
+            value = self.criterion(close, last.diagnosis)
+            if np.isfinite(value):
+                found.append(Contender(*verdict.key, close, value))
         return sorted(found, key=_criterion)
 
     def starts(self, last: Step, verdict: Verdict, wide: float = 10.0) -> list[ClosedLoop]:
@@ -556,6 +585,10 @@ def _criterion(contender: Contender) -> float:
 def _transmissions(diagnosis: Diagnosis) -> list[Verdict]:
     """Elasticity and backlash on the joint on which a free-form curve explains most."""
     joint = diagnosis.where[0].hypothesis.joint
+    return [] if joint is None else _transmissions_on(diagnosis, joint)
+
+
+def _transmissions_on(diagnosis: Diagnosis, joint: int) -> list[Verdict]:
     return [
         v
         for v in diagnosis.ranking

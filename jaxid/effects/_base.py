@@ -129,6 +129,15 @@ class AbstractTransmission(AbstractEffect):
         """No twist, at rest."""
         return jnp.zeros(2)
 
+    def after(self, other: "AbstractTransmission", load: float) -> "AbstractTransmission | None":
+        """At values that come close to another that was fitted; None where it knows of none.
+
+        **Arguments:**
+
+        - `load`: typical torque on the joint, N·m or N.
+        """
+        return None
+
     def present(self) -> Bool[Array, ""]:
         """Whether it gives way at all; where not, drive and link move as one."""
         return jnp.asarray(True)

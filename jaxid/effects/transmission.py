@@ -90,6 +90,16 @@ class Backlash(AbstractTransmission):
         """The gap times a factor."""
         return dataclasses.replace(self, gap=self.gap * factor)
 
+    def after(self, other: AbstractTransmission, load: float) -> "Backlash | None":
+        """A contact as stiff as an elasticity, in a gap as wide as its twist to both sides.
+
+        A contact that is much too stiff is a wall from behind which no refit finds back.
+        """
+        if not isinstance(other, JointElasticity):
+            return None
+        gap, stiffness = 2 * other.compliance * load, 1 / other.compliance
+        return dataclasses.replace(self, gap=gap, rotor=other.rotor, stiffness=stiffness)
+
     def present(self) -> Bool[Array, ""]:
         """Where there is a gap."""
         return self.gap > 0
