@@ -197,8 +197,12 @@ class _Search(eqx.Module):
         if outside and not self.convinces(contenders, last):
             contenders = self.second_thoughts(contenders, entries, last, say)
         if self.convinces(contenders, last):
-            contenders = self.with_siblings(contenders, last, say)
-            return None, (self.grown(last, contenders, say),)
+            grown = self.grown(last, contenders, say)
+            # A transmission that leaves nothing is the right one: its siblings take long to refit.
+            if any(map(self.matters([*steps, grown]), grown.diagnosis.where)):
+                more = self.with_siblings(contenders, last, say)
+                grown = grown if more[0] is contenders[0] else self.grown(last, more, say)
+            return None, (grown,)
         if outside and len(steps) < most and (further := self.detour(steps, contenders, say)):
             return None, further
         # A weak entry that no refit confirms is chance, unless a curve finds something as well.
