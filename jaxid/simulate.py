@@ -243,7 +243,6 @@ def prepare(
     **Raises:** `RecordingError` where the joints do not match, `ModelError` from the controller.
     """
     check_joints(loop, recordings[0])
-    check_law(loop)
     if noise is not None:
         _check_noise(noise, recordings)
     period = loop.controller.period
@@ -530,6 +529,7 @@ def simulate(
     """
     recordings = Recordings.of(recordings)
     batch = prepare(loop, recordings, noise)
+    check_law(loop)
     return by_recording(simulate_batch(with_substeps(loop, recordings), batch), recordings)
 
 

@@ -386,7 +386,7 @@ class _Search(eqx.Module):
             say(f"refit with {effect_on(*verdict.key)} in its place")
             instead = loop.with_effects((*loop.effects[:-1], other))
             instead = instead.free(*_held_shapes(instead))
-            plain = dataclasses.replace(_quiet(self.method), start="given")
+            plain = self.given()
             rough = fit(instead, self.recordings, plain)
             close = fit(rough.loop, self.recordings, self.whitened_method(last.diagnosis))
             value = self.criterion(close, last.diagnosis)
@@ -418,7 +418,7 @@ class _Search(eqx.Module):
             method = dataclasses.replace(self.whitened_method(last.diagnosis), filters=white)
             return [*found, fit(found[0], self.recordings, method).loop]
         held = _held_shapes(found[0])
-        plain = dataclasses.replace(_quiet(self.method), start="given")
+        plain = self.given()
         apart = [grown(effect.scaled(factor)).free(*held) for factor in (1.0, wide)]
         fits = [fit(loop, self.recordings, plain) for loop in apart]
         lost = (Status.misfit, Status.diverged)
@@ -444,12 +444,16 @@ class _Search(eqx.Module):
 
     def alternating(self) -> SeparablePEM:
         """The method with noise filters estimated along with the parameters."""
-        method = dataclasses.replace(_quiet(self.method), start="given")
+        method = self.given()
         return SeparablePEM(method, criterion="bic", highest=30, white=None, rounds=3)
+
+    def given(self) -> OEM:
+        """The output error to refit with, from where the loop is."""
+        return dataclasses.replace(_quiet(self.method), start="given")
 
     def whitened_method(self, diagnosis: Diagnosis) -> SeparablePEM:
         """The method with the noise filters of a diagnosis: efficient where noise is coloured."""
-        method = dataclasses.replace(_quiet(self.method), start="given")
+        method = self.given()
         return SeparablePEM(method, filters=diagnosis.noise)
 
     def criterion(self, found: Fit, diagnosis: Diagnosis) -> float:

@@ -45,7 +45,7 @@ def torque_along(
         return mismatch(loop, along(time, signals, tau))
 
     tau = jnp.zeros_like(signals[0])
-    if not any(acting) and not any(e.loaded for e in prompt):
+    if all(type(e).command is AbstractEffect.command and not e.loaded for e in prompt):
         return lacking(tau)
     # What drives do with a command, and friction that grows with it, are all but affine in it:
     # a few steps of Newton's method.
