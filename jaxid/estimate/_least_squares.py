@@ -380,7 +380,9 @@ class _Shared(eqx.Module):
 
         sums = at_once(part, range(len(self.parts)), self.threads)
         by_recording, *products = found.whole(start.shape[0])
-        loss, gram, slope = (jnp.asarray(np.sum(x, axis=0)) for x in zip(*sums, strict=True))
+        # Where a step diverges, infinities of both signs meet: it is refused, and no warning.
+        with np.errstate(invalid="ignore"):
+            loss, gram, slope = (jnp.asarray(np.sum(x, axis=0)) for x in zip(*sums, strict=True))
         return Point(theta, start, by_recording, loss, gram, slope, *products)
 
 
