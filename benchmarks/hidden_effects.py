@@ -186,6 +186,8 @@ def in_jaxid(effect: Any, plant: Any) -> fx.AbstractEffect:
             )
         case "Spring":
             return fx.Spring(j, e.stiffness, e.stiffness * e.rest)
+        case "Payload" if plant.joints == 1:
+            return fx.Payload(e.mass, 0.0, e.recordings, slides=True)
         case "Payload":
             return fx.Payload(e.mass, e.reach, e.recordings, (plant.L,))
         case "RotorInertia":

@@ -42,8 +42,8 @@ class LoadDependentFriction(AbstractEffect):
 class PositionDependentFriction(AbstractEffect):
     """Friction that varies with the angle, once and twice a turn (bent shafts, worn gears).
 
-    (A1 cos q + B1 sin q + A2 cos 2q + B2 sin 2q) sigma(v); a joint that slides counts its travel
-    as one turn.
+    (A1 cos q + B1 sin q + A2 cos 2q + B2 sin 2q) sigma(v). A joint that slides counts its travel
+    as half a turn, so that friction may rise from one end to the other.
     """
 
     joint: int = eqx.field(static=True)
@@ -61,7 +61,7 @@ class PositionDependentFriction(AbstractEffect):
             cls(
                 joint=j,
                 gamma=scene.sharpness(j),
-                turn=scene.travel(j) if scene.slides[j - 1] else 2 * np.pi,
+                turn=2 * scene.travel(j) if scene.slides[j - 1] else 2 * np.pi,
             )
             for j in scene.joints
         ]
