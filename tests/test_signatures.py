@@ -1,5 +1,7 @@
 """Signatures: the linear response against a difference of two whole simulations."""
 
+import dataclasses
+
 import equinox as eqx
 import independent as sim
 import jax
@@ -9,7 +11,7 @@ import pytest
 
 import jaxid
 from jaxid.discovery.linear import linearise
-from jaxid.discovery.signatures import amplitudes, signatures
+from jaxid.discovery.signatures import amplitudes, signatures, survey
 from jaxid.effects import (
     AbstractEffect,
     ActuatorLag,
@@ -17,6 +19,8 @@ from jaxid.effects import (
     Gravity,
     JointElasticity,
     LoadDependentFriction,
+    Motion,
+    PositionDependentFriction,
     Spring,
     Stribeck,
     TimeDelay,
@@ -140,3 +144,20 @@ def test_signatures_of_effects_with_states_begin_where_simulations_do():
         # Of second order in a lag of 2 ms under these gains: some hundredths.
         assert error < (0.06 if name in ("lag", "delay") else 1e-3), (name, error)
         assert along == pytest.approx(1.0, abs=0.01), name
+
+
+def test_friction_of_a_slider_may_rise_along_its_travel():
+    """With a constant beside them, as Coulomb friction is, the waves make a ramp within 2 %."""
+    time, travel = np.arange(101) * 1e-3, np.linspace(0.05, 0.3, 101)[:, None]
+    ones, none, label = jnp.ones(1), jnp.zeros(0), jnp.asarray(0)
+    motion = jax.vmap(lambda t, q: Motion(t, q, ones, 0 * ones, 0 * ones, none, label))(
+        jnp.asarray(time), jnp.asarray(travel)
+    )
+    record = jaxid.Recording(time, travel, 0 * travel, q_ref=travel)
+    scene = survey(jaxid.emps(), jaxid.Recordings.of(record), motion, ((),))
+    (effect,) = PositionDependentFriction.screened(scene)
+    waves = [dataclasses.replace(effect, **{name: 1.0}) for name in ("A1", "B1", "A2", "B2")]
+    columns = [jnp.ones((101, 1)), *(jax.vmap(wave.torque)(motion) for wave in waves)]
+    ramp, matrix = travel[:, 0], np.concatenate(columns, axis=1)
+    left = ramp - matrix @ np.linalg.lstsq(matrix, ramp)[0]
+    assert np.linalg.norm(left) < 0.02 * np.linalg.norm(ramp - ramp.mean())
