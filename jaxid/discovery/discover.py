@@ -14,7 +14,7 @@ from jaxtyping import Float
 from ..archive import classes_of
 from ..campaign import Campaign
 from ..control import OpenLoop
-from ..effects import AbstractEffect, AbstractTransmission
+from ..effects import AbstractEffect, AbstractTransmission, Coulomb
 from ..effects import catalogue as known
 from ..errors import FitError
 from ..estimate import OEM, Fit, SeparablePEM, Status, fit
@@ -322,12 +322,14 @@ class _Search(eqx.Module):
     ) -> list[Contender]:
         """More contenders, before anything is called outside the catalogue.
 
-        Entries further behind, since a shape between those of the grid may explain twice as much;
-        two effects that only together explain it; and elasticity and backlash, since a drive and a
-        link that come apart are far from what a small setting shows of them.
+        Entries further behind, since a shape between those of the grid may explain twice as much,
+        and what led may have led by a signature that is not true of large effects; two effects
+        that only together explain it; and elasticity and backlash, since a drive and a link that
+        come apart are far from what a small setting shows of them.
         """
         tried = {(c.name, c.joint) for c in contenders}
-        behind = [v for v in entries[:6] if v.evidence > 0.5 * entries[0].evidence]
+        behind = [v for v in entries[:6] if v.key not in tried]
+        behind = [v for v in behind if v.evidence > 0.5 * behind[0].evidence]
         more = (*behind, *last.diagnosis.pair, *_transmissions(last.diagnosis))
         others = {v.key: v for v in more}
         found = self.refit(last, [v for key, v in others.items() if key not in tried], say)
@@ -357,14 +359,27 @@ class _Search(eqx.Module):
         for k, verdict in enumerate(leading):
             called = effect_on(*verdict.key)
             say(f"refit with {called}, {k + 1} of {len(leading)}", k / len(leading))
-            tried = []
-            for loop in self.starts(last, verdict):
-                refitted = fit(loop, self.recordings, self.whitened_method(last.diagnosis))
-                value = self.criterion(refitted, last.diagnosis)
-                if np.isfinite(value):
-                    tried.append(Contender(*verdict.key, refitted, value))
+            method = self.whitened_method(last.diagnosis)
+            fits = [fit(loop, self.recordings, method) for loop in self.starts(last, verdict)]
+            if amplitudes(verdict.hypothesis.effect) and not _as_predicted(fits[0], last, verdict):
+                away = fit(self.unfiltered(fits[0].loop, last), self.recordings, method)
+                fits.append(away)
+            values = [self.criterion(refitted, last.diagnosis) for refitted in fits]
+            tried = [
+                Contender(*verdict.key, refitted, value)
+                for refitted, value in zip(fits, values, strict=True)
+                if np.isfinite(value) and _is_there(refitted, last.fit)
+            ]
             found += sorted(tried, key=_criterion)[:1]
         return sorted(found, key=_criterion)
+
+    def unfiltered(self, loop: ClosedLoop, last: Step) -> ClosedLoop:
+        """The loop fitted as if noise were white: filters that knew nothing of an effect bar it."""
+        # Output error, by the program that filters need anyway.
+        noise = last.diagnosis.noise
+        white = tuple(ARFilter(np.zeros(0), f.variance * f.gain) for f in noise)
+        method = dataclasses.replace(self.whitened_method(last.diagnosis), filters=white)
+        return fit(loop, self.recordings, method).loop
 
     def with_siblings(
         self, contenders: Sequence[Contender], last: Step, say: Callable[[str], None]
@@ -405,18 +420,14 @@ class _Search(eqx.Module):
         """
 
         def grown(effect: AbstractEffect) -> ClosedLoop:
-            return last.fit.loop.add(_inside(effect))
+            return _of_one_sign(last.fit.loop.add(_inside(effect)))
 
         effect, found = verdict.hypothesis.effect, [grown(last.diagnosis.predicted(verdict))]
         if amplitudes(effect):
             return found
         found.append(grown(effect))
         if not effect.contact:
-            # Output error, by the program that filters need anyway.
-            noise = last.diagnosis.noise
-            white = tuple(ARFilter(np.zeros(0), f.variance * f.gain) for f in noise)
-            method = dataclasses.replace(self.whitened_method(last.diagnosis), filters=white)
-            return [*found, fit(found[0], self.recordings, method).loop]
+            return [*found, self.unfiltered(found[0], last)]
         held = _held_shapes(found[0])
         plain = self.given()
         apart = [grown(effect.scaled(factor)).free(*held) for factor in (1.0, wide)]
@@ -432,7 +443,7 @@ class _Search(eqx.Module):
         can tell (how stiff a backlash's contact is): held at a wrong value they leave something to
         explain, and estimated from there they may end in a valley beside the right one.
         """
-        loop = best.fit.loop
+        loop = _of_one_sign(best.fit.loop)
         held = () if amplitudes(loop.effects[-1]) else _held_shapes(loop)
         released = _released(loop, [name for name in held if name not in loop.names])
         found = [best.fit]
@@ -567,7 +578,7 @@ class _Search(eqx.Module):
             f"{with_what}"
         )
         less = loop.with_effects((*loop.effects[:at], *instead, *loop.effects[at + 1 :]))
-        return fit(less, self.recordings, self.whitened_method(final.diagnosis))
+        return fit(_of_one_sign(less), self.recordings, self.whitened_method(final.diagnosis))
 
 
 def _entry(entry: Any) -> Any:
@@ -703,6 +714,36 @@ def _released(loop: ClosedLoop, names: Sequence[str]) -> list[ClosedLoop]:
     given = {p.name: np.asarray(p.where(loop)) for p in loop.parameters if p.name in names}
     changes = [{}, *({name: f * given[name]} for name in names for f in (0.5, 2.0))]
     return [loop.with_values(**change).free(*names) for change in changes]
+
+
+def _as_predicted(refitted: Fit, last: Step, verdict: Verdict, factor: float = 2.0) -> bool:
+    """Whether a refit gains about what the effect's signature had promised."""
+    before, after = (_fitted_criterion(f, last.diagnosis) for f in (last.fit, refitted))
+    return verdict.evidence / factor < before - after < verdict.evidence * factor
+
+
+def _is_there(refitted: Fit, before: Fit) -> bool:
+    """Whether anything of the effect that a refit has added shows in the recordings."""
+    new = [k for k, name in enumerate(refitted.names) if name not in before.names]
+    return not new or bool(np.isfinite(refitted.std[new]).any())
+
+
+def _of_one_sign(loop: ClosedLoop) -> ClosedLoop:
+    """The loop with one smoothed sign a joint, where that of its Coulomb friction is estimated.
+
+    Effects are added with the sharpness it had then, which may come out another beside them.
+    """
+    estimated, held = {}, []
+    for p in loop.parameters:
+        place = p.where.steps  # type: ignore[attr-defined]
+        if place[0] != "effects" or place[2:] != ("gamma",):
+            continue
+        effect = loop.effects[place[1]]
+        if isinstance(effect, Coulomb) and p.name in loop.names:
+            estimated[effect.joint] = float(effect.gamma)
+        elif p.name not in loop.names:
+            held.append((p.name, getattr(effect, "joint", None)))
+    return loop.with_values(**{name: estimated[j] for name, j in held if j in estimated})
 
 
 def _inside(effect: AbstractEffect) -> AbstractEffect:
