@@ -12,7 +12,7 @@ import pytest
 from independent import effects as fx
 
 import jaxid
-from jaxid.discovery.discover import _doubled, _entries, _released, _rivals, _Search
+from jaxid.discovery.discover import _doubled, _entries, _of_one_sign, _released, _rivals, _Search
 from jaxid.discovery.score import corrected, effective_tests
 from jaxid.discovery.signatures import candidates, survey
 from jaxid.discovery.story import Contender, Step
@@ -22,9 +22,12 @@ from jaxid.effects import (
     Curve,
     JointElasticity,
     Motion,
+    Payload,
     QuadraticDrag,
     Spring,
+    Stribeck,
     TorqueOffset,
+    TorqueSaturation,
     on_joint,
 )
 from jaxid.parameters import Scalar, parameter
@@ -582,3 +585,32 @@ def test_hidden_effects(shared_file, case):
     # Gravity reaches further on case_07's held-out recording than on those fitted, and even with
     # the true structure its estimate there is good to 1 %: 5 % above the floor.
     assert np.all(after <= (1.06 if case == "case_07" else 1.03) * floor)
+
+
+def test_effects_share_the_sharpness_that_is_estimated_for_their_joint():
+    worn = Stribeck(1, 0.0, 0.02, gamma=5.0)
+    loop = jaxid.emps().with_values(gamma1=1.2e4).add(worn)
+    assert float(_of_one_sign(loop).effects[-1].gamma) == 1.2e4
+    # What a user has freed, or never asked to estimate, is the user's.
+    freed = loop.free("gamma1_2")
+    assert float(_of_one_sign(freed).effects[-1].gamma) == 5.0
+    held = jaxid.scara().add(worn)
+    assert float(_of_one_sign(held).effects[-1].gamma) == 5.0
+
+
+@pytest.mark.slow
+def test_a_load_that_drives_the_axis_into_its_limit_is_found():
+    """Its signature promises an eighth of it, and a limit seems to explain five times more.
+
+    The drive is at the controller's limit in both recordings, in the loaded one for longer.
+    """
+    load = fx.Payload(3.4137, 0.3, ("fit_2",))
+    case = sim.make_case(1817948849, [load], noise="strong", robot="axis")
+    fit, held_out = recordings_of(case)
+    some = (Payload, TorqueSaturation, JointElasticity)
+    story = jaxid.discover(jaxid.emps(), fit, validate=held_out, catalogue=some, progress=False)
+    told = story.to_dict()
+    assert [(a["effect"], a["recordings"]) for a in told["added"]] == [("payload", ["fit_2"])]
+    mass = told["added"][0]["parameters"]["mass"]
+    assert abs(mass["value"] - load.mass) < 4 * mass["std"]
+    assert (told["error_percent"]["after"]["validate"] < 1.03 * floor_of(case)).all()

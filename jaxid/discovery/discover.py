@@ -195,7 +195,8 @@ class _Search(eqx.Module):
             return (None, faint) if faint else ("outside_catalogue" if outside else done, ())
         contenders = self.contenders(last, entries, say)
         if outside and not self.convinces(contenders, last):
-            contenders = self.second_thoughts(contenders, entries, last, say)
+            pair = [v for v in last.diagnosis.pair if v.key not in _added_twice(steps)]
+            contenders = self.second_thoughts(contenders, entries, pair, last, say)
         if self.convinces(contenders, last):
             grown = self.grown(last, contenders, say)
             # A transmission that leaves nothing is the right one: its siblings take long to refit.
@@ -317,6 +318,7 @@ class _Search(eqx.Module):
         self,
         contenders: Sequence[Contender],
         entries: Sequence[Verdict],
+        pair: Sequence[Verdict],
         last: Step,
         say: Callable[[str], None],
     ) -> list[Contender]:
@@ -330,7 +332,7 @@ class _Search(eqx.Module):
         tried = {(c.name, c.joint) for c in contenders}
         behind = [v for v in entries[:6] if v.key not in tried]
         behind = [v for v in behind if v.evidence > 0.5 * behind[0].evidence]
-        more = (*behind, *last.diagnosis.pair, *_transmissions(last.diagnosis))
+        more = (*behind, *pair, *_transmissions(last.diagnosis))
         others = {v.key: v for v in more}
         found = self.refit(last, [v for key, v in others.items() if key not in tried], say)
         return sorted([*contenders, *found], key=_criterion)
@@ -616,21 +618,26 @@ def _transmissions_on(diagnosis: Diagnosis, joint: int) -> list[Verdict]:
 
 
 def _entries(steps: Sequence[Step], matters: Callable[[Verdict], bool]) -> list[Verdict]:
-    """Entries of the last ranking that matter and can be added.
+    """Entries of the last ranking that matter and can be added."""
+    twice = _added_twice(steps)
+    return [
+        v
+        for v in steps[-1].diagnosis.ranking
+        if matters(v) and v.possible and v.evidence > 0 and v.key not in twice
+    ]
 
-    Twice at the most: two ends of a travel, two harmonics of a ripple. Three of a kind on one joint
-    are a series that comes close to something else.
+
+def _added_twice(steps: Sequence[Step]) -> set[tuple[str, int | None]]:
+    """What is not added again: two ends of a travel, two harmonics of a ripple are enough.
+
+    Three of a kind on one joint are a series that comes close to something else.
     """
     added = Counter(
         (s.added.effect_name(), getattr(s.added, "joint", None))
         for s in steps
         if s.added is not None
     )
-    return [
-        v
-        for v in steps[-1].diagnosis.ranking
-        if matters(v) and v.possible and v.evidence > 0 and added[v.key] < 2
-    ]
+    return {key for key, count in added.items() if count > 1}
 
 
 def _leading(entries: Sequence[Verdict]) -> list[Verdict]:
@@ -718,7 +725,8 @@ def _released(loop: ClosedLoop, names: Sequence[str]) -> list[ClosedLoop]:
 
 def _as_predicted(refitted: Fit, last: Step, verdict: Verdict, factor: float = 2.0) -> bool:
     """Whether a refit gains about what the effect's signature had promised."""
-    before, after = (_fitted_criterion(f, last.diagnosis) for f in (last.fit, refitted))
+    with np.errstate(over="ignore", invalid="ignore"):
+        before, after = (_fitted_criterion(f, last.diagnosis) for f in (last.fit, refitted))
     return verdict.evidence / factor < before - after < verdict.evidence * factor
 
 
