@@ -22,12 +22,10 @@ from jaxid.effects import (
     Curve,
     JointElasticity,
     Motion,
-    Payload,
     QuadraticDrag,
     Spring,
     Stribeck,
     TorqueOffset,
-    TorqueSaturation,
     on_joint,
 )
 from jaxid.parameters import Scalar, parameter
@@ -600,17 +598,17 @@ def test_effects_share_the_sharpness_that_is_estimated_for_their_joint():
 
 @pytest.mark.slow
 def test_a_load_that_drives_the_axis_into_its_limit_is_found():
-    """Its signature promises an eighth of it, and a limit seems to explain five times more.
+    """Its signature promises an eighth of it, and filters that know no more bar the way.
 
     The drive is at the controller's limit in both recordings, in the loaded one for longer.
     """
     load = fx.Payload(3.4137, 0.3, ("fit_2",))
     case = sim.make_case(1817948849, [load], noise="strong", robot="axis")
-    fit, held_out = recordings_of(case)
-    some = (Payload, TorqueSaturation, JointElasticity)
-    story = jaxid.discover(jaxid.emps(), fit, validate=held_out, catalogue=some, progress=False)
-    told = story.to_dict()
-    assert [(a["effect"], a["recordings"]) for a in told["added"]] == [("payload", ["fit_2"])]
-    mass = told["added"][0]["parameters"]["mass"]
-    assert abs(mass["value"] - load.mass) < 4 * mass["std"]
-    assert (told["error_percent"]["after"]["validate"] < 1.03 * floor_of(case)).all()
+    search = search_of(case)
+    start = search.begin(jaxid.emps(), silent)
+    verdict = next(v for v in start.diagnosis.ranking if v.key == ("payload", None))
+    assert start.diagnosis.amplitude(verdict)[0] < 0.2 * load.mass
+    (best,) = search.refit(start, [verdict], silent)
+    place = best.fit.names.index("payload")
+    assert abs(best.fit.theta[place] - load.mass) < 4 * best.fit.std[place]
+    assert best.fit.loop.effects[-1].recordings == load.recordings
