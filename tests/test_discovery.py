@@ -328,16 +328,22 @@ def test_contact_is_released_from_several_stiffnesses():
     assert _released(loop, ()) == []
 
 
+def fits_replaced(monkeypatch, result: jaxid.Fit) -> list:
+    """Loops and methods that a discovery fits from now on, each with this result."""
+    calls = []
+
+    def fit(loop, recordings, method):
+        calls.append((loop, method))
+        return dataclasses.replace(result, loop=loop)
+
+    monkeypatch.setattr(sys.modules["jaxid.discovery.discover"], "fit", fit)
+    return calls
+
+
 @pytest.mark.xdist_group("offset")
 def test_contact_is_free_from_the_start_in_some_refits(offset_case, offset_story, monkeypatch):
     search, start = search_of(offset_case), offset_story[0].steps[0]
-    plain = []
-
-    def fit(loop, recordings, method):
-        plain.append(method)
-        return dataclasses.replace(start.fit, loop=loop)
-
-    monkeypatch.setattr(sys.modules["jaxid.discovery.discover"], "fit", fit)
+    calls = fits_replaced(monkeypatch, start.fit)
     of = {v.key: v for v in start.diagnosis.ranking}
     screened = of["backlash", 2].hypothesis.effect
     loops = search.starts(start, of["backlash", 2])
@@ -345,22 +351,16 @@ def test_contact_is_free_from_the_start_in_some_refits(offset_case, offset_story
     assert gaps[1:] == pytest.approx([1.0, 1.0, 10.0])
     assert ["kc2" in loop.names for loop in loops] == [False, False, True, True]
     # Without noise filters, which knew nothing of a gap.
-    assert [type(method) for method in plain] == [jaxid.OEM, jaxid.OEM]
+    assert [type(method) for _, method in calls] == [jaxid.OEM, jaxid.OEM]
     assert len(search.starts(start, of["joint_elasticity", 2])) == 3
-    assert [f.order for f in plain[-1].filters] == [0, 0]
+    assert [f.order for f in calls[-1][1].filters] == [0, 0]
     assert len(search.starts(start, of["spring", 2])) == 1
 
 
 @pytest.mark.xdist_group("offset")
 def test_backlash_is_tried_where_an_elasticity_leads(offset_case, offset_story, monkeypatch):
     search, start = search_of(offset_case), offset_story[0].steps[0]
-    tried = []
-
-    def fit(loop, recordings, method):
-        tried.append(loop)
-        return dataclasses.replace(start.fit, loop=loop)
-
-    monkeypatch.setattr(sys.modules["jaxid.discovery.discover"], "fit", fit)
+    calls = fits_replaced(monkeypatch, start.fit)
     monkeypatch.setattr(_Search, "criterion", lambda self, fit, _: 3.0)
     soft = JointElasticity(joint=2, compliance=0.02, rotor=0.03)
     leading = Contender(
@@ -368,12 +368,13 @@ def test_backlash_is_tried_where_an_elasticity_leads(offset_case, offset_story, 
     )
     found = search.with_siblings([leading], start, silent)
     assert [(c.name, c.joint) for c in found] == [("backlash", 2), ("joint_elasticity", 2)]
-    gap = tried[0].effects[-1]
+    loop, _ = calls[0]
+    gap = loop.effects[-1]
     load = np.std(np.concatenate([r.tau[:, 1] for r in search.recordings]))
     assert float(gap.gap) == pytest.approx(2 * 0.02 * load)
     assert float(gap.rotor) == 0.03
     assert float(gap.stiffness) == pytest.approx(50.0)
-    assert "kc2" in tried[0].names
+    assert "kc2" in loop.names
     # Not of a backlash, and not of what is no transmission.
     of = {v.key: v.hypothesis.effect for v in start.diagnosis.ranking}
     for name in ("backlash", "spring"):
