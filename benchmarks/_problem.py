@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxid
-from jaxid.estimate._least_squares import Problem
+from jaxid.estimate.minimise.problem import Problem
 from jaxid.parameters import Bounds
-from jaxid.simulate import Batch, prepare, set_substeps, simulate
+from jaxid.simulation.runs import Batch, prepare, set_substeps, simulate
 
 SUBSTEPS = 4
 PERIOD = 0.01

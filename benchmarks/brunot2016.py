@@ -22,11 +22,21 @@ import pandas as pd
 from scipy import optimize
 
 import jaxid
-from jaxid import figures
-from jaxid.estimate import _least_squares as ls
+from jaxid.display import figures
+from jaxid.estimate.minimise import problem as ls
 from jaxid.noise import autocorrelation, innovations
 
-from ._brunot import NAMES, ORDERS, PAPER, PAPER_ERRORS, Motion, draw, motion, recording, truth
+from ._brunot import (
+    NAMES,
+    ORDERS,
+    PAPER,
+    PAPER_ERRORS,
+    Motion,
+    draw,
+    motion,
+    recording,
+    truth,
+)
 
 GIVEN = jaxid.OEM(start="given", progress=False)
 JOINT = jaxid.JointPEM(GIVEN, orders=ORDERS)

@@ -19,10 +19,10 @@ import numpy as np
 import pandas as pd
 
 import jaxid
-from jaxid.estimate._regression import Filtering, decimator
-from jaxid.estimate.deviations import Reduced, score_covariance, spent_by
+from jaxid.estimate.covariance import Reduced, score_covariance, spent_by
 from jaxid.estimate.idim import Stacked, solve, stack
 from jaxid.estimate.refit import Refitted, refit_signals
+from jaxid.estimate.regression import Filtering, decimator
 
 from ._brunot import LEVELS, ORDERS, Motion, draw, motion, recording, sim, truth
 from ._output import options

@@ -32,8 +32,8 @@ import pandas as pd
 import scipy.io
 
 import jaxid
-from jaxid import archive, saved
 from jaxid.errors import JaxidError
+from jaxid.storage import archive, saved
 
 # What a reader may take for a file of a few kilobytes, on a machine that does other things too.
 SLOWEST = 20.0

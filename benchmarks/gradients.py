@@ -19,7 +19,7 @@ import pandas as pd
 from scipy import optimize
 
 import jaxid
-from jaxid.simulate import (
+from jaxid.simulation.runs import (
     Interval,
     _instant_at,
     advance,
@@ -33,7 +33,16 @@ from jaxid.simulate import (
 )
 
 from ._output import options, report
-from ._problem import NOISE, PERIOD, SUBSTEPS, TRUTH, cad, interleaved, machine, recordings
+from ._problem import (
+    NOISE,
+    PERIOD,
+    SUBSTEPS,
+    TRUTH,
+    cad,
+    interleaved,
+    machine,
+    recordings,
+)
 
 P = 8
 Way = Callable[[jax.Array], jax.Array]

@@ -21,8 +21,8 @@ from scipy import signal, stats
 
 import jaxid
 from jaxid import effects as fx
-from jaxid.campaign import Campaign, Failed
 from jaxid.parameters import list_parameters
+from jaxid.storage.campaign import Campaign, Failed
 from tests import independent as sim
 
 from . import stepwise

@@ -25,11 +25,11 @@ import pandas as pd
 import plotly.graph_objects as go
 
 import jaxid
-from jaxid import figures
 from jaxid.control import ComputedTorque
+from jaxid.display import figures
 from jaxid.excitation import Excitation
-from jaxid.fourier import FourierSeries
-from jaxid.simulate import initial, prepare, run, run_with_sensitivities, with_substeps
+from jaxid.signals.fourier import FourierSeries
+from jaxid.simulation.runs import initial, prepare, run, run_with_sensitivities, with_substeps
 
 from ._output import report
 

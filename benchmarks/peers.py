@@ -29,8 +29,8 @@ import pandas as pd
 from scipy import integrate, optimize
 
 import jaxid
-from jaxid.estimate._least_squares import linearisation, point_around
-from jaxid.simulate import each, initial, prepare, run
+from jaxid.estimate.minimise.problem import linearisation, point_around
+from jaxid.simulation.runs import each, initial, prepare, run
 
 from ._output import options, report
 from ._problem import (

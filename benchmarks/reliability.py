@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 
 import jaxid
-from jaxid.campaign import Campaign
+from jaxid.storage.campaign import Campaign
 from tests import independent as sim
 
 PARTS = ("kills", "interrupts", "size")
@@ -220,8 +220,8 @@ def _recording_bootstrap(fit: jaxid.Fit, draws: int) -> np.ndarray:
 def _normal_equations(fit: jaxid.Fit, recording: jaxid.Recording) -> tuple[np.ndarray, np.ndarray]:
     import jax.numpy as jnp
 
-    from jaxid.estimate._least_squares import sensitivity
-    from jaxid.simulate import prepare
+    from jaxid.estimate.minimise.problem import sensitivity
+    from jaxid.simulation.runs import prepare
 
     one = jaxid.Recordings.of(recording)
     batch = prepare(fit.loop, one)

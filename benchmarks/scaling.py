@@ -20,8 +20,8 @@ import pandas as pd
 import jaxid
 from jaxid.discovery.linear import linearise as linear_system
 from jaxid.discovery.linear import respond
-from jaxid.estimate._least_squares import linearisation
-from jaxid.simulate import Batch, prepare
+from jaxid.estimate.minimise.problem import linearisation
+from jaxid.simulation.runs import Batch, prepare
 
 from ._output import options, report
 from ._problem import SUBSTEPS, cad, interleaved, machine, problem, recordings, truth

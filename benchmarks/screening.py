@@ -17,9 +17,9 @@ import pandas as pd
 
 import jaxid
 from jaxid.discovery.signatures import candidates
-from jaxid.estimate._least_squares import sensitivity
+from jaxid.estimate.minimise.problem import sensitivity
 from jaxid.estimate.oem import pieces_of
-from jaxid.simulate import prepare, with_substeps
+from jaxid.simulation.runs import prepare, with_substeps
 from tests import independent as sim
 
 from ._output import options, report

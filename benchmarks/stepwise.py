@@ -17,10 +17,10 @@ from scipy import stats
 import jaxid
 from jaxid import effects as fx
 from jaxid.errors import FitError
-from jaxid.estimate._regression import decimator, filtered, linear_parameters, regression
-from jaxid.loop import inverse
+from jaxid.estimate.regression import decimator, filtered, linear_parameters, regression
 from jaxid.parameters import list_parameters, read_values, write_values
-from jaxid.simulate import Simulated, recording_label
+from jaxid.simulation.loop import inverse
+from jaxid.simulation.runs import Simulated, recording_label
 
 Key = tuple[str, int | None]
 # A column of which the others leave less than this share says nothing.

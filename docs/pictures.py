@@ -11,8 +11,8 @@ from jaxtyping import Float
 from plotly.subplots import make_subplots
 
 import jaxid
-from jaxid import figures
-from jaxid.discovery.diagnose import Verdict, coordinate_unit
+from jaxid.discovery.diagnosis import Verdict, coordinate_unit
+from jaxid.display import figures
 from jaxid.effects import Curve
 
 OUT = Path(__file__).parent / "img" / "effects"

@@ -63,7 +63,6 @@ from .excitation import Excitation as Excitation  # noqa: E402
 from .excitation import Limits as Limits  # noqa: E402
 from .excitation import PlanarReach as PlanarReach  # noqa: E402
 from .excitation import optimal_excitation as optimal_excitation  # noqa: E402
-from .loop import ClosedLoop as ClosedLoop  # noqa: E402
 from .parameters import parameter as parameter  # noqa: E402
 from .recording import Recording as Recording  # noqa: E402
 from .recording import Recordings as Recordings  # noqa: E402
@@ -71,10 +70,11 @@ from .recording import read as read  # noqa: E402
 from .robots import emps as emps  # noqa: E402
 from .robots import scara as scara  # noqa: E402
 from .robots import two_link as two_link  # noqa: E402
-from .saved import load as load  # noqa: E402
-from .saved import save as save  # noqa: E402
-from .simulate import simulate as simulate  # noqa: E402
-from .stepping import Stepping as Stepping  # noqa: E402
+from .simulation.loop import ClosedLoop as ClosedLoop  # noqa: E402
+from .simulation.runs import simulate as simulate  # noqa: E402
+from .simulation.stepping import Stepping as Stepping  # noqa: E402
+from .storage.saved import load as load  # noqa: E402
+from .storage.saved import save as save  # noqa: E402
 
 if _collecting:
     # What was imported counts as old, so that no collection is due at once.

@@ -100,7 +100,7 @@ def load_robot(robot: str) -> Any:
     **Raises:** `ModelError` that says what was not found.
     """
     from . import robots
-    from .loop import ClosedLoop
+    from .simulation.loop import ClosedLoop
 
     ready = {"scara": robots.scara, "two-link": robots.two_link, "emps": robots.emps}
     if robot in ready:
@@ -358,8 +358,8 @@ def _pooled(result: Any) -> dict[str, float]:
 
 def _with_fitted(loop: Any, path: Path, own: frozenset[type] = frozenset()) -> Any:
     if path.suffix == ".jaxid":
-        from .archive import classes_of
-        from .saved import load
+        from .storage.archive import classes_of
+        from .storage.saved import load
 
         saved = load(path, classes_of(loop) | own)
         if not hasattr(saved, "loop"):

@@ -3,7 +3,7 @@
 from .arms import SCARA, Axis, TwoLink
 from .control import PD, AbstractController, Cascade
 from .effects import Coulomb, TorqueOffset, Viscous
-from .loop import ClosedLoop
+from .simulation.loop import ClosedLoop
 
 
 def _friction(joints: int, gamma: float = 100.0) -> tuple[Viscous | Coulomb, ...]:

@@ -15,8 +15,8 @@ from jaxid.arms import SCARA, AbstractArm, Axis, TwoLink
 from jaxid.control import OpenLoop
 from jaxid.effects import AbstractEffect, Coulomb, Motion, Viscous, smooth_sign
 from jaxid.errors import ModelError
-from jaxid.loop import inverse
 from jaxid.parameters import list_parameters, read_values
+from jaxid.simulation.loop import inverse
 
 G = 9.81
 LENGTH = 0.5

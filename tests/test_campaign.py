@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxid.campaign import Campaign, Failed
 from jaxid.errors import FitError, SaveError
+from jaxid.storage.campaign import Campaign, Failed
 
 # One process imports jaxid, and one child after the other works in the folder until it is killed.
 KILLED_AGAIN_AND_AGAIN = """
     import os, random, signal, sys, time
     import numpy as np
-    from jaxid.campaign import Campaign
+    from jaxid.storage.campaign import Campaign
 
     folder, log, kills = sys.argv[1], sys.argv[2], int(sys.argv[3])
 
@@ -158,7 +158,7 @@ def test_another_plan_is_refused(tmp_path: Path) -> None:
 def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Campaign(tmp_path / "c", {}):
         pass
-    monkeypatch.setattr("jaxid.archive.versions", lambda: {"jaxid-robotics": "9.1"})
+    monkeypatch.setattr("jaxid.storage.archive.versions", lambda: {"jaxid-robotics": "9.1"})
     with pytest.raises(SaveError, match="jaxid-robotics"):
         Campaign(tmp_path / "c", {}).__enter__()
 
@@ -233,7 +233,7 @@ def test_workers_of_a_killed_process_end(tmp_path: Path) -> None:
         import multiprocessing, os, time
 
         def work():
-            from jaxid.campaign import _end_with_parent
+            from jaxid.storage.campaign import _end_with_parent
             _end_with_parent()
             print(os.getpid(), flush=True)
             time.sleep(60)

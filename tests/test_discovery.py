@@ -12,8 +12,8 @@ import pytest
 from independent import effects as fx
 
 import jaxid
-from jaxid.discovery.discover import _doubled, _entries, _of_one_sign, _released, _rivals, _Search
 from jaxid.discovery.score import corrected, effective_tests
+from jaxid.discovery.search import _doubled, _entries, _of_one_sign, _released, _rivals, _Search
 from jaxid.discovery.signatures import candidates, survey
 from jaxid.discovery.story import Contender, Step
 from jaxid.effects import (
@@ -336,7 +336,7 @@ def fits_replaced(monkeypatch, result: jaxid.Fit) -> list:
         calls.append((loop, method))
         return dataclasses.replace(result, loop=loop)
 
-    monkeypatch.setattr(sys.modules["jaxid.discovery.discover"], "fit", fit)
+    monkeypatch.setattr(sys.modules["jaxid.discovery.search"], "fit", fit)
     return calls
 
 

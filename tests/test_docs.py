@@ -79,7 +79,7 @@ def test_the_api_shows_what_daily_names_do(site: Path) -> None:
     last = {name.rpartition(".")[2] for name in shown}
     for name in ("read", "fit", "OEM", "compare", "diagnose", "discover", "ClosedLoop", "Curve"):
         assert name in last
-    assert "jaxid.discovery.discover.discover" in shown
+    assert "jaxid.discover" in shown
 
 
 def test_every_effect_of_the_catalogue_is_described_and_drawn() -> None:

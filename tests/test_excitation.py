@@ -10,8 +10,8 @@ import jaxid
 from jaxid.errors import FitError, LimitsError
 from jaxid.excitation import optimal
 from jaxid.excitation._information import Settings, closed_loop_columns, torque_along
-from jaxid.fourier import fourier_basis
-from jaxid.simulate import set_substeps
+from jaxid.signals.fourier import fourier_basis
+from jaxid.simulation.runs import set_substeps
 
 TRUE = sim.TwoLink(gamma=20.0)
 TRUTH = {name: getattr(TRUE, name) for name in TRUE.base}

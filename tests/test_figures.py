@@ -6,7 +6,7 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 
-from jaxid import figures
+from jaxid.display import figures
 
 TIME = np.arange(400) * 0.01
 WAVE = np.sin(TIME)

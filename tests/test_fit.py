@@ -11,16 +11,10 @@ from scipy import optimize
 
 import jaxid
 from jaxid.control import OpenLoop, Tracking
-from jaxid.effects import (
-    EncoderEccentricity,
-    Hysteresis,
-    JointElasticity,
-    TorqueOffset,
-    Viscous,
-)
+from jaxid.effects import EncoderEccentricity, Hysteresis, JointElasticity, TorqueOffset, Viscous
 from jaxid.errors import FitError, RecordingError
-from jaxid.estimate import _least_squares as ls
-from jaxid.estimate._base import determined_covariance
+from jaxid.estimate.minimise import problem as ls
+from jaxid.estimate.result import determined_covariance
 from jaxid.settings import _words, check_words
 
 # What one worker has fitted serves all of them.

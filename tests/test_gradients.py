@@ -18,9 +18,9 @@ from jaxid import effects
 from jaxid.arms import Axis
 from jaxid.control import PD, Cascade, OpenLoop, Sampled, Tracking
 from jaxid.effects import AbstractEffect, Coulomb, Viscous
-from jaxid.loop import ClosedLoop
 from jaxid.recording import Recordings
-from jaxid.simulate import (
+from jaxid.simulation.loop import ClosedLoop
+from jaxid.simulation.runs import (
     SIGNALS,
     initial,
     prepare,

@@ -11,7 +11,7 @@ from jaxid.control import Cascade
 from jaxid.effects import AsymmetricFriction, TorqueOffset
 from jaxid.errors import FitError
 from jaxid.estimate.idim import Stacked, solve
-from jaxid.smoothing import low_pass, signal_cutoff
+from jaxid.signals.smoothing import low_pass, signal_cutoff
 
 # Janot, Gautier, Brunot 2019: value and standard deviation.
 PUBLISHED = {

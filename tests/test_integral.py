@@ -11,7 +11,13 @@ import jaxid
 from jaxid.effects import RotorInertia
 from jaxid.errors import FitError
 from jaxid.estimate._operators import Operator
-from jaxid.fourier import FourierSeries, fourier_basis, period_of, repeated, settle_harmonics
+from jaxid.signals.fourier import (
+    FourierSeries,
+    fourier_basis,
+    period_of,
+    repeated,
+    settle_harmonics,
+)
 
 PERIOD, TICK, PERIODS = 4.0, 0.004, 4
 LINES = (

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import jaxid
-from jaxid.estimate.deviations import optimum_of
+from jaxid.estimate.covariance import optimum_of
 from jaxid.estimate.refit import Lanes, _refit_some
-from jaxid.lapack import column_basis, smallest_eigenvalue, solve
+from jaxid.linear_algebra import column_basis, smallest_eigenvalue, solve
 
 DEMO = Path(jaxid.__file__).parent / "demo" / "clean"
 # A call with the shapes it is given: `custom_call @lapack_dgetrf_ffi(%0) … : (tensor<5x4x4xf64>)`.

@@ -36,10 +36,10 @@ from jaxid.effects import (
     on_joint,
 )
 from jaxid.errors import ModelError
-from jaxid.loop import Outside, instant, inverse, rest
 from jaxid.parameters import Scalar, parameter
-from jaxid.simulate import fastest_rate, with_substeps
-from jaxid.stepping import RK4
+from jaxid.simulation.loop import Outside, instant, inverse, rest
+from jaxid.simulation.runs import fastest_rate, with_substeps
+from jaxid.simulation.stepping import RK4
 
 LINES = sim.MultiSine(
     (((0.5, 2.0, 0.3), (0.2, 5.0, 1.0)), ((0.6, 3.0, 2.0), (0.2, 6.0, 0.5))), rise=1.0

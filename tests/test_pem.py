@@ -11,7 +11,7 @@ import pytest
 
 import jaxid
 from jaxid.errors import FitError, NoiseError
-from jaxid.estimate import _least_squares as ls
+from jaxid.estimate.minimise import problem as ls
 from jaxid.estimate.refit import Lanes, refit
 from jaxid.noise import ARFilter, fit_var
 
@@ -248,7 +248,7 @@ def test_many_fits_tell_how_far_they_are(fits, monkeypatch):
         yield lambda text, share=None: said.append((title, show, text, share))
 
     # The package has a function of that name where the module was.
-    monkeypatch.setattr(sys.modules["jaxid.estimate.bootstrap"], "working", recorded)
+    monkeypatch.setattr(sys.modules["jaxid.estimate.resampling"], "working", recorded)
     jaxid.bootstrap(fits["oem"], 20, progress=False)
     assert said == [
         ("bootstrap of scara", False, f"{done} of 20 fits", done / 20) for done in (0, 8, 16)

@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from test_discover_cli import told
 
 import jaxid
-from jaxid import archive, saved
 from jaxid.errors import SaveError
+from jaxid.storage import archive, saved
 
 # What one worker has fitted serves all of them.
 pytestmark = pytest.mark.xdist_group("demo")

@@ -16,10 +16,10 @@ import pytest
 
 import jaxid
 from jaxid.control import Tracking
-from jaxid.estimate import _least_squares as least_squares
-from jaxid.estimate._least_squares import Problem, linearise, point_around, reweighted
+from jaxid.estimate.minimise import problem as least_squares
+from jaxid.estimate.minimise.problem import Problem, linearise, point_around, reweighted
 from jaxid.parameters import Bounds
-from jaxid.simulate import prepare, with_substeps
+from jaxid.simulation.runs import prepare, with_substeps
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "jaxid" / "demo" / "clean"

@@ -27,7 +27,7 @@ from jaxid.effects import (
     TorqueOffset,
     on_joint,
 )
-from jaxid.simulate import prepare, set_substeps
+from jaxid.simulation.runs import prepare, set_substeps
 
 LINES = sim.MultiSine(
     (((0.5, 2.0, 0.3), (0.2, 5.0, 1.0)), ((0.6, 3.0, 2.0), (0.2, 6.0, 0.5))), rise=1.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxid
-from jaxid.unrolling import unrolled
+from jaxid.simulation.unrolling import unrolled
 
 
 def _gather(x, y):
@@ -139,7 +139,7 @@ def quick_reference():
 
 
 def test_a_program_for_any_number_of_steps_gives_the_numbers_of_a_fixed_one(quick_reference):
-    from jaxid.simulate import initial, prepare, run, set_substeps
+    from jaxid.simulation.runs import initial, prepare, run, set_substeps
 
     batch = prepare(jaxid.scara(), jaxid.Recordings.of(quick_reference))
     intervals = jax.tree.map(lambda leaf: leaf[0], batch.intervals)

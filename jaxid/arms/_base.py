@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..lapack import smallest_eigenvalue
+from ..linear_algebra import smallest_eigenvalue
 from ..parameters import list_parameters, read_values, write_values
 
 

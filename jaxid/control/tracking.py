@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..recording import Recording
-from ..smoothing import even_times, resampled, signal_cutoff, smooth_motion
+from ..signals.smoothing import even_times, resampled, signal_cutoff, smooth_motion
 from ._base import AbstractController, Reading, Reference, Signals
 
 

@@ -9,16 +9,16 @@ import pandas as pd
 import plotly.graph_objects as go
 from jaxtyping import Float
 
-from .. import figures
 from ..control import OpenLoop
+from ..display import figures
+from ..display.shown import AbstractShown
 from ..effects import AbstractTransmission
 from ..errors import FitError
 from ..excitation import Limits
-from ..loop import ClosedLoop
 from ..recording import Recording
-from ..showing import AbstractShown
-from ..simulate import prepare, with_substeps
-from .diagnose import Diagnosis, Verdict, _at_samples, _sampled
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import prepare, with_substeps
+from .diagnosis import Diagnosis, Verdict, _at_samples, _sampled
 from .linear import base_columns, linearise
 from .score import Data, Gram
 from .signatures import signatures

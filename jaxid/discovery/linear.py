@@ -9,8 +9,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..effects import AbstractTransmission, Motion
-from ..loop import ClosedLoop
-from ..simulate import SIGNALS, Batch, Interval, advance, each, initial, run, with_rolled_stages
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import (
+    SIGNALS,
+    Batch,
+    Interval,
+    advance,
+    each,
+    initial,
+    run,
+    with_rolled_stages,
+)
 
 Place = Literal["push", "noise", "rate", "pull"]
 

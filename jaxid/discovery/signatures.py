@@ -14,12 +14,12 @@ from ..effects import AbstractEffect, Coulomb, Curve, Motion, Scene, check_decla
 from ..effects import catalogue as known
 from ..effects.curve import curve_over
 from ..errors import ModelError
-from ..lapack import exponential
-from ..loop import ClosedLoop, effect_loads
+from ..linear_algebra import exponential
 from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..recording import Recordings
-from ..sharding import at_once, taken
-from ..simulate import Batch, each, initial, run, with_rolled_stages
+from ..simulation.loop import ClosedLoop, effect_loads
+from ..simulation.runs import Batch, each, initial, run, with_rolled_stages
+from ..simulation.sharing import at_once, taken
 from .linear import Linearised, respond
 
 

@@ -13,15 +13,15 @@ import pandas as pd
 import plotly.graph_objects as go
 from jaxtyping import Float
 
-from .. import figures
+from ..display import figures
+from ..display.shown import AbstractShown
 from ..effects import AbstractEffect, Curve
 from ..errors import ModelError
 from ..estimate import Fit
-from ..loop import ClosedLoop
-from ..saved import save
-from ..showing import AbstractShown
-from .compare import Comparison
-from .diagnose import Diagnosis, effect_parameters, on_recordings, over_recordings
+from ..simulation.loop import ClosedLoop
+from ..storage.saved import save
+from .comparison import Comparison
+from .diagnosis import Diagnosis, effect_parameters, on_recordings, over_recordings
 
 Outcome = Literal["adequate", "explained", "outside_catalogue"]
 

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from ..effects import Motion
 from ..errors import FitError
-from ..loop import ClosedLoop, inverse
 from ..recording import Recording
-from ._base import determined_covariance
-from ._regression import effect_states
+from ..simulation.loop import ClosedLoop, inverse
+from .regression import effect_states
+from .result import determined_covariance
 from .states import AbstractStates, FourierStates
 
 # Errors of (position, velocity, acceleration) in the rows of a regression.

@@ -9,12 +9,12 @@ from jaxtyping import Float
 
 from ..effects import AbstractEffect, AbstractTransmission, check_declared
 from ..errors import FitError
-from ..loop import ClosedLoop
 from ..recording import Recording, Recordings
 from ..recording._checks import missing_after
-from ..simulate import check_joints, check_law
-from ._base import AbstractMethod, Fit, Status
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import check_joints, check_law
 from .oem import OEM
+from .result import AbstractMethod, Fit, Status
 
 
 def fit(

@@ -13,17 +13,17 @@ from jaxtyping import Array, Float
 
 from ..effects import AbstractTransmission, Motion
 from ..errors import FitError
-from ..loop import ClosedLoop, effect_loads
 from ..parameters import Bounds, list_parameters, read_values, write_values
 from ..recording import Recording, Recordings
-from ..simulate import Simulated, recording_label
-from ..smoothing import evened
-from ._base import AbstractMethod, Fit, determined_covariance
+from ..signals.smoothing import evened
+from ..simulation.loop import ClosedLoop, effect_loads
+from ..simulation.runs import Simulated, recording_label
 from ._encoder import Kernels, errors_of, row_errors, solve_weighted
 from ._operators import Operator
-from ._regression import effect_states, linear_parameters, regression
-from .deviations import score_covariance
+from .covariance import score_covariance
 from .idim import Solved, Stacked, regression_fit, solve
+from .regression import effect_states, linear_parameters, regression
+from .result import AbstractMethod, Fit, determined_covariance
 from .states import AbstractStates
 
 EncoderWeights = Literal["joint", "encoder"]

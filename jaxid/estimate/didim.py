@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..errors import FitError
-from ..loop import ClosedLoop
 from ..parameters import Bounds, write_values
 from ..recording import Recordings
-from ..simulate import Simulated, compared, simulate
-from ._base import AbstractMethod, Fit, Status
-from ._regression import Filtering, linear_parameters
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import Simulated, compared, simulate
 from .idim import Solved, Stacked, Weights, regression_fit, solve, stack
+from .regression import Filtering, linear_parameters
+from .result import AbstractMethod, Fit, Status
 
 
 def physical(loop: ClosedLoop, theta: Float[np.ndarray, " parameters"]) -> ClosedLoop:

@@ -4,12 +4,12 @@ from typing import Literal
 
 import equinox as eqx
 
-from ..loop import ClosedLoop
 from ..recording import Recording, Recordings
-from ._base import AbstractMethod, Fit
+from ..simulation.loop import ClosedLoop
 from ._operators import Operator
 from ._split import EncoderWeights, fit_rows, split_rows
 from .integral import default_pole
+from .result import AbstractMethod, Fit
 from .states import AbstractStates, LowPass
 
 

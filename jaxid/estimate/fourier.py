@@ -2,10 +2,10 @@
 
 import equinox as eqx
 
-from ..loop import ClosedLoop
 from ..recording import Recording, Recordings
-from ._base import AbstractMethod, Fit
+from ..simulation.loop import ClosedLoop
 from ._split import EncoderWeights, fit_rows, motion_rows
+from .result import AbstractMethod, Fit
 from .states import FourierStates
 
 

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import FitError
-from ..loop import ClosedLoop
 from ..parameters import Bounds, Parameter, write_values
 from ..recording import Recordings
-from ._base import AbstractMethod, Fit, Status, determined_covariance, relative_errors
-from ._regression import Filtering, decimator, filtered, linear_parameters, regression
+from ..simulation.loop import ClosedLoop
+from .regression import Filtering, decimator, filtered, linear_parameters, regression
+from .result import AbstractMethod, Fit, Status, determined_covariance, relative_errors
 
 Weights = Literal["ordinary", "joint", "robust"]
 

@@ -5,12 +5,12 @@ from typing import Literal
 
 import equinox as eqx
 
-from ..loop import ClosedLoop
 from ..recording import Recording, Recordings
-from ..smoothing import signal_cutoff
-from ._base import AbstractMethod, Fit
+from ..signals.smoothing import signal_cutoff
+from ..simulation.loop import ClosedLoop
 from ._operators import Operator
 from ._split import EncoderWeights, fit_rows, split_rows
+from .result import AbstractMethod, Fit
 from .states import AbstractStates, LowPass
 
 

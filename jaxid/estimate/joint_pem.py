@@ -9,16 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..display.progress import working
 from ..errors import NoiseError
-from ..loop import ClosedLoop
 from ..noise import ARFilter, Criterion, Noise, VectorAR, check_series
 from ..parameters import Bounds
-from ..progress import working
 from ..recording import Recordings
-from ..simulate import prepare, with_substeps
-from ._base import AbstractMethod, Fit, Status
-from ._least_squares import Coefficients, Minimum, Problem, minimise
-from .deviations import Deviations
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import prepare, with_substeps
+from .covariance import Deviations
+from .minimise.problem import Coefficients, Minimum, Problem, minimise
 from .oem import (
     OEM,
     _converge,
@@ -31,6 +30,7 @@ from .oem import (
     start_values,
 )
 from .pem import Order, keeping, noise_filters
+from .result import AbstractMethod, Fit, Status
 
 
 class JointPEM(AbstractMethod):

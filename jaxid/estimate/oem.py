@@ -14,14 +14,13 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ..control import OpenLoop, Reading
+from ..display.progress import working
 from ..errors import FitError, JaxidError
-from ..loop import ClosedLoop
 from ..noise import ARFilter, Noise, VectorAR
 from ..parameters import Bounds
-from ..progress import working
 from ..recording import Recording, Recordings
-from ..sharding import taken
-from ..simulate import (
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import (
     Batch,
     at_rest,
     compared,
@@ -31,11 +30,12 @@ from ..simulate import (
     simulate_batch,
     with_substeps,
 )
-from ._base import AbstractMethod, Fit, Status, relative_errors
-from ._least_squares import Minimum, Problem, Sensitivity, minimise, reweighted
-from .deviations import SAID, Deviations, Optimum, covariance_of
+from ..simulation.sharing import taken
+from .covariance import SAID, Deviations, Optimum, covariance_of
 from .didim import DIDIM, physical
 from .idim import IDIM
+from .minimise.problem import Minimum, Problem, Sensitivity, minimise, reweighted
+from .result import AbstractMethod, Fit, Status, relative_errors
 
 Output = Literal["torque", "position", "both"]
 

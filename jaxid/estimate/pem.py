@@ -9,8 +9,8 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import numpy as np
 
+from ..display.progress import working
 from ..errors import NoiseError
-from ..loop import ClosedLoop
 from ..noise import (
     ARFilter,
     Criterion,
@@ -22,12 +22,12 @@ from ..noise import (
     innovations,
     levels,
 )
-from ..progress import working
 from ..recording import Recordings
-from ..simulate import with_substeps
-from ._base import AbstractMethod, Fit, Status
-from .deviations import Deviations
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import with_substeps
+from .covariance import Deviations
 from .oem import OEM, _converge, _Done, _report, _signals, start_values
+from .result import AbstractMethod, Fit, Status
 
 
 class Order(NamedTuple):

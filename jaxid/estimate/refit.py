@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..display.progress import silent
 from ..errors import FitError
-from ..lapack import solve
+from ..linear_algebra import solve
 from ..noise import ARFilter, VectorAR, fit_ar
-from ..progress import silent
-from ._base import Fit
-from ._least_squares import (
+from .covariance import Optimum, optimum_of
+from .minimise.problem import (
     Point,
     Problem,
     Sensitivity,
@@ -25,7 +25,7 @@ from ._least_squares import (
     raw_residual,
     unfiltered,
 )
-from .deviations import Optimum, optimum_of
+from .result import Fit
 
 # Lanes of one vmap: enough to fill the vector units, few enough for the caches.
 LANES = 8

@@ -7,12 +7,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..fourier import Harmonics, fourier_basis, period_of, settle_harmonics
 from ..recording import Recording
 from ..settings import check_words
-from ..simulate import Simulated
-from ..smoothing import even_times, low_pass, resampled
-from ._regression import Filtering
+from ..signals.fourier import Harmonics, fourier_basis, period_of, settle_harmonics
+from ..signals.smoothing import even_times, low_pass, resampled
+from ..simulation.runs import Simulated
+from .regression import Filtering
 
 Rates = tuple[
     Float[np.ndarray, "samples columns"],

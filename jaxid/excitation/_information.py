@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..effects import AbstractEffect, Motion
-from ..estimate._regression import linear_parameters, mismatch
-from ..loop import ClosedLoop
+from ..estimate.regression import linear_parameters, mismatch
 from ..parameters import Parameter, read_values, write_values
 from ..settings import check_words
-from ..simulate import NOBODY, Interval, initial, run_with_sensitivities
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import NOBODY, Interval, initial, run_with_sensitivities
 
 Kind = Literal["inverse-dynamics", "closed-loop"]
 Criterion = Literal["determinant", "deviation", "condition"]

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from ..errors import LimitsError
 from ..recording import Recording
-from ..smoothing import even_times, signal_cutoff, smooth_motion
+from ..signals.smoothing import even_times, signal_cutoff, smooth_motion
 
 
 def _vector(value: object) -> Float[np.ndarray, " joints"]:

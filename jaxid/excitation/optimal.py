@@ -13,15 +13,15 @@ import plotly.graph_objects as go
 import scipy
 from jaxtyping import Array, Float
 
-from .. import figures
+from ..display import figures
+from ..display.shown import AbstractShown
 from ..errors import FitError, LimitsError
-from ..estimate._base import determined_covariance
-from ..fourier import FourierSeries, fourier_basis
-from ..loop import ClosedLoop
+from ..estimate.result import determined_covariance
 from ..parameters import Bounds
 from ..recording import Recording, Recordings
-from ..showing import AbstractShown
-from ..simulate import fastest_rate, set_substeps
+from ..signals.fourier import FourierSeries, fourier_basis
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import fastest_rate, set_substeps
 from ._information import (
     Criterion,
     Kind,

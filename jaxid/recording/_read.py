@@ -13,8 +13,8 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from ..archive import npy
 from ..errors import JaxidError, RecordingError, require
+from ..storage.archive import npy
 from ._checks import Gaps, is_number
 from ._columns import Columns, Table, from_frame, pick, unique
 from ._matlab import order_of, variables

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..discovery import Discovery, next_experiment
-from ..discovery.diagnose import Diagnosis, Verdict
+from ..discovery.diagnosis import Diagnosis, Verdict
 from ..errors import JaxidError
 from ..excitation import Limits
 from ._html import Content, figure, number, table, tag

@@ -9,10 +9,10 @@ from importlib import metadata
 import numpy as np
 import plotly.graph_objects as go
 
-from .. import figures
 from ..discovery import Discovery
-from ..discovery.diagnose import Diagnosis, Verdict
+from ..discovery.diagnosis import Diagnosis, Verdict
 from ..discovery.story import Contender, Step
+from ..display import figures
 from ..recording import Recording
 from ._html import Content, Markup, details, figure, join, link, number, probability, table, tag
 from ._next import recommended

@@ -5,11 +5,11 @@ import plotly.graph_objects as go
 from jaxtyping import Float
 from scipy.ndimage import uniform_filter1d
 
-from .. import figures
 from ..discovery import Comparison, Discovery, compare
-from ..discovery.diagnose import Verdict, coordinate_unit
+from ..discovery.diagnosis import Verdict, coordinate_unit
 from ..discovery.score import whitened
 from ..discovery.story import Step
+from ..display import figures
 from ..effects import Curve
 from ..noise import autocorrelation
 from ._html import Markup, figure

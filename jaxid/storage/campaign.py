@@ -19,8 +19,8 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from ..errors import JaxidError, SaveError, sentence
 from . import archive
-from .errors import JaxidError, SaveError, sentence
 from .files import write_whole
 from .saved import registry
 

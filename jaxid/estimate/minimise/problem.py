@@ -13,9 +13,10 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from ..lapack import column_basis
-from ..loop import ClosedLoop
-from ..sharding import (
+from ...linear_algebra import column_basis
+from ...simulation.loop import ClosedLoop
+from ...simulation.runs import SIGNALS, Batch, each, initial, run, run_with_sensitivities
+from ...simulation.sharing import (
     EndToEnd,
     at_once,
     cores,
@@ -25,8 +26,7 @@ from ..sharding import (
     shares_of,
     taken,
 )
-from ..simulate import SIGNALS, Batch, each, initial, run, run_with_sensitivities
-from ._base import Status
+from ..result import Status
 
 
 class Sensitivity(eqx.Module):

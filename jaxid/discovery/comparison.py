@@ -11,20 +11,19 @@ import pandas as pd
 import plotly.graph_objects as go
 from jaxtyping import Float
 
-from .. import figures
 from ..control import OpenLoop
+from ..display import figures
+from ..display.shown import AbstractShown
 from ..effects import PeriodicDisturbance
 from ..errors import FitError, RecordingError
 from ..estimate import Filtering, Fit
-from ..estimate._base import errors_to_dict, joint_columns, relative_errors
-from ..estimate._regression import filtered
 from ..estimate.oem import OEM, from_best_starts, oem_of, pieces_of
-from ..loop import ClosedLoop
+from ..estimate.regression import filtered
+from ..estimate.result import errors_to_dict, joint_columns, relative_errors
 from ..noise import autocorrelation
 from ..recording import Recording, Recordings
-from ..saved import save
-from ..showing import AbstractShown
-from ..simulate import (
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import (
     Simulated,
     band_of,
     by_recording,
@@ -33,6 +32,7 @@ from ..simulate import (
     simulate_batch,
     with_substeps,
 )
+from ..storage.saved import save
 
 
 class Comparison(AbstractShown):
@@ -109,7 +109,7 @@ class Comparison(AbstractShown):
         Free-form curves of every coordinate and tones are held against the whitened residuals,
         what the model's own parameters can absorb taken off.
         """
-        from .diagnose import diagnose
+        from .diagnosis import diagnose
 
         return diagnose(self, catalogue=(PeriodicDisturbance,), progress=False).where_table()
 

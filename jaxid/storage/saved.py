@@ -9,8 +9,8 @@ from typing import Any
 import diffrax
 import equinox as eqx
 
+from ..errors import SaveError, sentence
 from . import archive
-from .errors import SaveError, sentence
 from .files import write_whole
 
 # Larger than any story of a day's recordings, and small enough to be read on a laptop.

@@ -9,8 +9,8 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float
 
-from .errors import RecordingError
-from .recording import Recording
+from ..errors import RecordingError
+from ..recording import Recording
 
 ORDER = 4
 

@@ -5,8 +5,8 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from .errors import FitError
-from .recording import Recording
+from ..errors import FitError
+from ..recording import Recording
 from .smoothing import even_times, resampled
 
 # The part of a motion that does not repeat, relative to the motion, above which it is aperiodic.

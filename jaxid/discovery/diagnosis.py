@@ -15,29 +15,23 @@ import pandas as pd
 import plotly.graph_objects as go
 from jaxtyping import Float
 
-from .. import figures
+from ..display import figures
+from ..display.progress import working
+from ..display.shown import AbstractShown
 from ..effects import AbstractEffect, AbstractTransmission, Curve, Motion, Scene
 from ..effects import catalogue as known
 from ..errors import FitError, ModelError
 from ..estimate import Fit
 from ..estimate.oem import _free_starts, _signals, from_best_starts, oem_of, pieces_of
-from ..loop import ClosedLoop
 from ..noise import ARFilter
 from ..parameters import write_values
-from ..progress import working
 from ..recording import Recordings
-from ..saved import save
-from ..showing import AbstractShown
-from ..simulate import Batch, prepare, with_substeps
-from .compare import Comparison
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import Batch, prepare, with_substeps
+from ..storage.saved import save
+from .comparison import Comparison
 from .linear import Linearised, base_columns, linearise
-from .score import (
-    Data,
-    Gram,
-    chance,
-    corrected,
-    effective_tests,
-)
+from .score import Data, Gram, chance, corrected, effective_tests
 from .separate import columns_of, estimate_noise, leftover
 from .signatures import Hypothesis, amplitudes, candidates, curves, signatures, survey
 

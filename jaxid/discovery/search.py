@@ -11,20 +11,20 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..archive import classes_of
-from ..campaign import Campaign
 from ..control import OpenLoop
+from ..display.progress import working
 from ..effects import AbstractEffect, AbstractTransmission, Coulomb
 from ..effects import catalogue as known
 from ..errors import FitError
 from ..estimate import OEM, Fit, SeparablePEM, Status, fit
-from ..loop import ClosedLoop
 from ..noise import ARFilter, fit_ar
 from ..parameters import Bounds, list_parameters, read_values, write_values
-from ..progress import working
 from ..recording import Recording, Recordings
-from .compare import compare
-from .diagnose import Diagnosis, Verdict, diagnose
+from ..simulation.loop import ClosedLoop
+from ..storage.archive import classes_of
+from ..storage.campaign import Campaign
+from .comparison import compare
+from .diagnosis import Diagnosis, Verdict, diagnose
 from .score import whitened
 from .signatures import amplitudes
 from .story import Contender, Discovery, Outcome, Step, effect_on, step_name

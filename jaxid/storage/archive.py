@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from .errors import SaveError, sentence
+from ..errors import SaveError, sentence
 
 # Raised whenever an older jaxid could not read what this one writes; older formats stay readable.
 FORMAT = 1

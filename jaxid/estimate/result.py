@@ -14,14 +14,14 @@ import pandas as pd
 import plotly.graph_objects as go
 from jaxtyping import Float
 
-from .. import figures
+from ..display import figures
+from ..display.shown import AbstractShown
 from ..errors import FitError
-from ..loop import ClosedLoop
 from ..noise import ARFilter, VectorAR, innovations, ljung_box
 from ..recording import Recording, Recordings
-from ..saved import save
 from ..settings import check_words
-from ..showing import AbstractShown
+from ..simulation.loop import ClosedLoop
+from ..storage.saved import save
 
 
 class Status(enum.Enum):

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .arms import AbstractArm
-from .control import AbstractController, Reading, Reference
-from .effects import AbstractEffect, AbstractTransmission, Motion
-from .errors import ModelError
-from .parameters import (
+from ..arms import AbstractArm
+from ..control import AbstractController, Reading, Reference
+from ..effects import AbstractEffect, AbstractTransmission, Motion
+from ..errors import ModelError
+from ..parameters import (
     Parameter,
     Vector,
     list_parameters,

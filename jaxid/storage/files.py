@@ -5,7 +5,7 @@ import os
 import secrets
 from pathlib import Path
 
-from .errors import SaveError, sentence
+from ..errors import SaveError, sentence
 
 
 def write_whole(path: str | os.PathLike[str], content: bytes) -> Path:

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from ..errors import FitError
 from ..noise import Noise, fit_ar, innovations
 from ..parameters import Bounds
-from ._base import Fit, determined_covariance
-from ._least_squares import Problem, Sensitivity, absorb_start, linearise, unfiltered
+from .minimise.problem import Problem, Sensitivity, absorb_start, linearise, unfiltered
+from .result import Fit, determined_covariance
 
 Deviations = Literal["sandwich", "white", "paper"]
 

@@ -12,11 +12,11 @@ import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from .control import Reading, Reference
-from .errors import JaxidError, ModelError, RecordingError
+from ..control import Reading, Reference
+from ..errors import JaxidError, ModelError, RecordingError
+from ..recording import Recording, Recordings
+from ..signals.smoothing import Band
 from .loop import ClosedLoop, Instant, Outside, State, behind, instant, rest, settle
-from .recording import Recording, Recordings
-from .smoothing import Band
 from .stepping import RK4, flow
 from .unrolling import unrolled
 

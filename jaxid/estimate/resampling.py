@@ -7,14 +7,14 @@ import pandas as pd
 import plotly.graph_objects as go
 from jaxtyping import Bool, Float
 
-from .. import figures
+from ..display import figures
+from ..display.progress import working
+from ..display.shown import AbstractShown
 from ..errors import FitError
 from ..noise import ARFilter, VectorAR, fit_ar, innovations, levels
-from ..progress import working
-from ..showing import AbstractShown
-from ._base import Fit
-from .deviations import optimum_of
+from .covariance import optimum_of
 from .refit import drawn_noise, redrawn, refit_signals
+from .result import Fit
 
 
 class Bootstrap(AbstractShown):

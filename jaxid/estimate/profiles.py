@@ -11,13 +11,13 @@ import plotly.graph_objects as go
 import scipy
 from jaxtyping import Float
 
-from .. import figures
+from ..display import figures
+from ..display.progress import working
+from ..display.shown import AbstractShown
 from ..errors import FitError
-from ..progress import working
-from ..showing import AbstractShown
-from ._base import Fit
-from .deviations import Reduced, covariance_of, optimum_of
+from .covariance import Reduced, covariance_of, optimum_of
 from .refit import Lanes, refit
+from .result import Fit
 
 # In deviations: dense enough for a cubic, wide enough for intervals of 99.7 %.
 REACH = np.array([-4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0])

@@ -11,11 +11,11 @@ from jaxtyping import Array, Float
 
 from ..effects import Motion
 from ..errors import FitError
-from ..loop import ClosedLoop, inverse
 from ..parameters import Parameter, read_values, write_values
 from ..recording import Recording
-from ..simulate import Simulated, recording_label
-from ..smoothing import even_times, resampled, signal_cutoff, smooth_motion
+from ..signals.smoothing import even_times, resampled, signal_cutoff, smooth_motion
+from ..simulation.loop import ClosedLoop, inverse
+from ..simulation.runs import Simulated, recording_label
 
 
 class Filtering(eqx.Module):
