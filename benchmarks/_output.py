@@ -3,6 +3,7 @@
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -17,7 +18,21 @@ def options(description: str | None) -> argparse.Namespace:
 
 def report(table: pd.DataFrame, json_file: Path | None, form: str = ".3f") -> None:
     """Prints a table, and writes it as JSON records where a file is named."""
+    show(table, form)
+    write(records(table), json_file)
+
+
+def show(table: pd.DataFrame, form: str = ".3f") -> None:
+    """Prints a table."""
     print(table.to_string(float_format=lambda x: format(x, form)))
+
+
+def records(table: pd.DataFrame, **more: str) -> list[dict[str, Any]]:
+    """The rows of a table with their index, and what else is to stand in each."""
+    return [{**more, **row} for row in table.reset_index().to_dict(orient="records")]
+
+
+def write(rows: list[dict[str, Any]], json_file: Path | None) -> None:
+    """Writes rows as JSON where a file is named."""
     if json_file is not None:
-        records = table.reset_index().to_dict(orient="records")
-        json_file.write_text(json.dumps(records, indent=1, ensure_ascii=False) + "\n")
+        json_file.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n")

@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxid
-from jaxid.estimate.minimise.problem import Problem
+from jaxid.estimate.minimise import Problem
 from jaxid.parameters import Bounds
-from jaxid.simulation.runs import Batch, prepare, set_substeps, simulate
+from jaxid.simulation.batch import Batch, prepare
+from jaxid.simulation.runs import simulate
+from jaxid.simulation.steps import set_substeps
 
 SUBSTEPS = 4
 PERIOD = 0.01
@@ -41,10 +43,12 @@ def truth() -> jaxid.ClosedLoop:
     return cad().with_values(**TRUTH)
 
 
-def recordings(count: int, seconds: float, seed: int = 0) -> jaxid.Recordings:
+def recordings(
+    count: int, seconds: float, seed: int = 0, period: float = PERIOD
+) -> jaxid.Recordings:
     """Simulated recordings of multi-sines that start at rest, with noise in the torque."""
     rng = np.random.default_rng(seed)
-    time_ = PERIOD * np.arange(round(seconds / PERIOD) + 1)
+    time_ = period * np.arange(round(seconds / period) + 1)
     fade = np.clip(time_ / 1.5, 0, 1)[:, None]
     fade = fade**3 * (10 - 15 * fade + 6 * fade**2)
     bare = []

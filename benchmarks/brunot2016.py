@@ -23,7 +23,7 @@ from scipy import optimize
 
 import jaxid
 from jaxid.display import figures
-from jaxid.estimate.minimise import problem as ls
+from jaxid.estimate import minimise as ls
 from jaxid.noise import autocorrelation, innovations
 
 from ._brunot import (
@@ -164,7 +164,7 @@ def _residual(problem: ls.Problem, theta: jax.Array) -> jax.Array:
     loop = problem.loop.with_theta(theta[:own])
     raw = ls.raw_residual(loop, problem.batch, problem.weights, problem.signals)
     blank = jnp.zeros((*raw.shape, 0))
-    plain = ls.Sensitivity(raw, raw, blank, None)
+    plain = ls.Sensitivity(raw, raw, blank, None, jnp.zeros(len(raw), int))
     return problem.whitened(plain, theta[own:]).residual
 
 

@@ -17,7 +17,9 @@ import pandas as pd
 
 import jaxid
 from jaxid.excitation import Excitation
-from jaxid.excitation.optimal import information_along, make_design, margins_on, random_references
+from jaxid.excitation.descent import random_references
+from jaxid.excitation.design import information_along, make_design
+from jaxid.excitation.reference import margins_on
 
 from . import li2023
 from ._output import options, report

@@ -1,13 +1,17 @@
-"""The same fit with every way to its derivatives: error, time, memory, compilation, success.
+"""Which minimiser, which gradient: one fit by every minimiser, and its gradient by every way.
 
-Reverse mode and the backsolve adjoint give the gradient of one number, so for them a row is the
-gradient of the sum of squares; all others give the whole Jacobian. Errors are against forward mode
-with eight times as many steps: they hold the integration's error too, which is the first row's.
+The problem is one: output error of the SCARA along one recording, white noise. The first table is
+that of `benchmarks.minimisers`. The second has the gradient of the squared error, five per cent
+beside the truth: its error against extrapolated differences of the same discrete simulation (so
+that what is left is the gradient's own error, not the integration's), seconds of the first call,
+milliseconds of later ones, and the peak of resident memory above that of the simulation alone.
+Every row has a process of its own, where nothing is compiled yet.
 
 python -m benchmarks.gradients [--quick] [--json FILE]
 """
 
-import time
+import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -16,264 +20,234 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from scipy import optimize
+from jaxtyping import Array, Float
 
 import jaxid
-from jaxid.simulation.runs import (
-    Interval,
-    _instant_at,
-    advance,
-    each,
-    initial,
-    prepare,
-    run,
-    run_with_sensitivities,
-    set_substeps,
-    unflatten,
-)
+from jaxid.estimate.minimise import point_around
+from jaxid.simulation.batch import Interval, prepare
+from jaxid.simulation.dynamics import unflatten
+from jaxid.simulation.integration import initial, instant_at
+from jaxid.simulation.runs import each, run
+from jaxid.simulation.stepping import RK4
+from jaxid.simulation.unrolling import unrolled
 
-from ._output import options, report
-from ._problem import (
-    NOISE,
-    PERIOD,
-    SUBSTEPS,
-    TRUTH,
-    cad,
-    interleaved,
-    machine,
-    recordings,
-)
+from . import minimisers
+from ._fresh import cold_and_warm, each_afresh, peak_memory
+from ._output import options, records, show, write
+from ._problem import NOISE, PERIOD, SUBSTEPS, TRUTH, cad, machine, recordings
 
-P = 8
-Way = Callable[[jax.Array], jax.Array]
+Theta = Float[Array, " parameters"]
+Way = Callable[[Theta], Array]
+
+ALONE = "simulation alone"
+OURS = "forward mode, jaxid"
+TWO_POINT, THREE_POINT = "two-point differences", "three-point differences"
+ADJOINTS: dict[str, diffrax.AbstractAdjoint] = {
+    "forward mode, ForwardMode": diffrax.ForwardMode(),
+    "reverse mode, RecursiveCheckpointAdjoint": diffrax.RecursiveCheckpointAdjoint(),
+    "reverse mode, DirectAdjoint": diffrax.DirectAdjoint(),
+    "reverse mode, BacksolveAdjoint": diffrax.BacksolveAdjoint(),
+}
+WAYS = (ALONE, OURS, *ADJOINTS, TWO_POINT, THREE_POINT)
+# Compiling is most of a short run: one reverse mode is enough for it.
+FEW = tuple(way for way in WAYS if not way.endswith(("CheckpointAdjoint", "BacksolveAdjoint")))
 
 
-def ways(recs: jaxid.Recordings, loop: jaxid.ClosedLoop) -> tuple[dict[str, Way], dict[str, Way]]:
-    """Functions of the parameters: those that give Jacobians, and those that give gradients."""
+def simulation(recs: jaxid.Recordings, adjoint: diffrax.AbstractAdjoint | None) -> Way:
+    """Torque as a function of the parameters, `(recordings, samples, joints)`.
+
+    The only place that knows how a loop is integrated.
+
+    **Arguments:**
+
+    - `adjoint`: of one `diffrax.diffeqsolve` for each recording, with the steps that jaxid takes;
+      None for jaxid's own run.
+    """
+    loop = cad()
     batch = prepare(loop, recs)
-    starts = batch.intervals, batch.q0, batch.v0
+    # NumPy's arrays: the backsolve adjoint takes no derivative by what it closes over.
+    drives = jax.tree.map(np.asarray, (batch.intervals, batch.q0, batch.v0))
 
-    def torque(theta):
+    def own(theta: Theta) -> Array:
         changed = loop.with_theta(theta)
-        return each(lambda i, q, v: run(changed, i, initial(changed, i, q, v))[1][:, 0], *starts)
+        return each(lambda i, q, v: run(changed, i, initial(changed, i, q, v))[1][:, 0], *drives)
 
-    def forward(theta):
-        changed = loop.with_theta(theta)
+    def by_diffrax(theta: Theta) -> Array:
+        one = [jax.tree.map(lambda leaf, k=k: leaf[k], drives) for k in range(len(recs))]
+        return jnp.stack([_solved(loop, theta, *drive, adjoint) for drive in one])
 
-        def one(i, q, v):
-            x0 = initial(changed, i, q, v)
-            return run_with_sensitivities(changed, i, x0, jnp.zeros((x0.shape[0], P)), (0,))[1]
-
-        return each(one, *starts)[:, :, 0]
-
-    def augmented(theta):
-        return each(lambda i, q, v: _augmented(loop, theta, i, q, v), *starts)
-
-    def two_point(theta):
-        h = 1e-6 * jnp.maximum(jnp.abs(theta), 0.1)
-        # One program for all points, or the compiler would see each as another simulation.
-        points = jax.lax.map(torque, jnp.concatenate([theta[None], theta + jnp.diag(h)]))
-        return jnp.moveaxis(points[1:] - points[0], 0, -1) / h
-
-    def three_point(theta):
-        h = 1e-5 * jnp.maximum(jnp.abs(theta), 0.1)
-        points = jax.lax.map(torque, jnp.concatenate([theta + jnp.diag(h), theta - jnp.diag(h)]))
-        return jnp.moveaxis(points[:P] - points[P:], 0, -1) / (2 * h)
-
-    def loss(theta):
-        changed = loop.with_theta(theta)
-
-        @jax.checkpoint
-        def interval(x, i):
-            after, seen = advance(changed, i, x)
-            return after, seen[0]
-
-        def one(i, q, v):
-            return jax.lax.scan(interval, initial(changed, i, q, v), i)[1]
-
-        return jnp.sum((batch.tau - each(one, *starts)) ** 2)
-
-    # The adjoint differentiates by all that is handed to it, so the reference stays outside.
-    first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], starts)
-
-    def backsolve(theta):
-        return jnp.sum((batch.tau[0] - _backsolved(loop, theta, *first)) ** 2)
-
-    jacobians = {
-        "forward mode through the steps": forward,
-        "sensitivity equations, augmented": augmented,
-        "two-point differences": two_point,
-        "three-point differences": three_point,
-    }
-    gradients = {"reverse mode, checkpoints": jax.grad(loss)}
-    if len(recs) == 1:
-        gradients["backsolve adjoint"] = jax.grad(backsolve)
-    return jacobians, gradients
+    return own if adjoint is None else by_diffrax
 
 
-def _rate(loop: jaxid.ClosedLoop, theta: jax.Array, interval: Interval, t, x):
-    changed = loop.with_theta(theta)
-    now = _instant_at(changed, interval, t, unflatten(changed)(x))
-    return jnp.concatenate([now.derivative.q, now.derivative.v]), now.command
-
-
-def _augmented(loop, theta, intervals: Interval, q, v):
-    """Torque's derivatives by integrating S' = df/dx S + df/dtheta beside the state."""
-
-    def rate(i, t, x, s):
-        field = lambda th, y: _rate(loop, th, i, t, y)  # noqa: E731
-        along = lambda e, d: jax.jvp(field, (theta, x), (e, d))  # noqa: E731
-        (dx, _), (ds, dtau) = jax.vmap(along, in_axes=(0, 1), out_axes=((None, None), -1))(
-            jnp.eye(P), s
-        )
-        return dx, ds, dtau
-
-    def body(carry, i):
-        h = i.h / SUBSTEPS
-        shown = rate(i, i.t0, *carry)[2]
-
-        def substep(k, carry):
-            x, s = carry
-            t = i.t0 + k * h
-            a = rate(i, t, x, s)[:2]
-            b = rate(i, t + h / 2, x + h / 2 * a[0], s + h / 2 * a[1])[:2]
-            c = rate(i, t + h / 2, x + h / 2 * b[0], s + h / 2 * b[1])[:2]
-            d = rate(i, t + h, x + h * c[0], s + h * c[1])[:2]
-            return tuple(
-                y + h / 6 * (ka + 2 * (kb + kc) + kd)
-                for y, ka, kb, kc, kd in zip(carry, a, b, c, d, strict=True)
-            )
-
-        return jax.lax.fori_loop(0, SUBSTEPS, substep, carry), shown
-
-    first = jnp.concatenate([q, v]), jnp.zeros((4, P))
-    return jax.lax.scan(body, first, intervals)[1]
-
-
-def _backsolved(loop, theta, intervals: Interval, q, v):
-    """Torque by diffrax over the whole recording, with its continuous adjoint."""
+def _solved(loop: jaxid.ClosedLoop, theta: Theta, intervals: Interval, q, v, adjoint) -> Array:
     times = intervals.t0
 
-    def at(t):
-        k = jnp.clip(((t - times[0]) / PERIOD).astype(int), 0, len(times) - 1)
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[k], intervals)
+    def now(interval: Interval, t, x, theta: Theta):
+        changed = loop.with_theta(theta)
+        found = instant_at(changed, interval, t, unflatten(changed)(x))
+        return jnp.concatenate([found.derivative.q, found.derivative.v]), found.command
 
+    def field(t, x, theta: Theta):
+        k = jnp.clip(((t - times[0]) / PERIOD).astype(int), 0, len(times) - 1)
+        interval = jax.tree.map(lambda leaf: jnp.asarray(leaf)[k], intervals)
+        return unrolled(now, interval, t, x, theta)(interval, t, x, theta)[0]
+
+    # Backwards in time diffrax turns the sign of a step, which jaxid's RK4 does not ask for.
+    backwards = isinstance(adjoint, diffrax.BacksolveAdjoint)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, x, theta: _rate(loop, theta, at(t), t, x)[0]),
-        diffrax.Tsit5(),
+        diffrax.ODETerm(field),
+        diffrax.Tsit5() if backwards else RK4(),
         times[0],
         times[-1],
         PERIOD / SUBSTEPS,
         jnp.concatenate([q, v]),
         theta,
         saveat=diffrax.SaveAt(ts=times),
-        adjoint=diffrax.BacksolveAdjoint(),
-        max_steps=None,
+        adjoint=adjoint,
+        # Times are sums of steps, and rounding may leave one more to take.
+        max_steps=SUBSTEPS * len(times),
     )
-    return jax.vmap(lambda t, x, i: _rate(loop, theta, i, t, x)[1])(times, solution.ys, intervals)
+    return jax.vmap(lambda i, x: now(i, i.t0, x, theta)[1])(intervals, solution.ys)
 
 
-def table(recs: jaxid.Recordings, budget: float) -> list[dict[str, Any]]:
-    """Error, time, memory and compilation of each way."""
-    theta = jnp.asarray(list(TRUTH.values())) * 1.05
-    fine, _ = ways(recs, set_substeps(cad(), 8 * SUBSTEPS))
-    exact = np.asarray(jax.jit(fine["forward mode through the steps"])(theta))
-    simulated = _residual(recs, set_substeps(cad(), 8 * SUBSTEPS), theta)
-    gradient = -2 * np.einsum("rkj,rkjp->p", simulated, exact)
-    jacobians, gradients = ways(recs, cad())
-    calls, rows = {}, {}
-    for name, way in {**jacobians, **gradients}.items():
-        started = time.perf_counter()
-        made = jax.jit(way).lower(theta).compile()
-        seconds = time.perf_counter() - started
-        found = np.asarray(made(theta))
-        target = gradient if name in gradients else exact
-        calls[name] = lambda made=made: made(theta)
-        memory = made.memory_analysis()
-        rows[name] = {
-            "task": "gradient" if name in gradients else "Jacobian",
-            "recordings": len(recs),
-            "way": name,
-            "error": np.linalg.norm(found - target) / np.linalg.norm(target),
-            "compile_s": seconds,
-            "temporary_MiB": memory.temp_size_in_bytes / 2**20 if memory else np.nan,
-        }
-    best = interleaved(calls, budget, most=50)
-    return [{**row, "ms": 1e3 * best[name]} for name, row in rows.items()]
+def squared_error(recs: jaxid.Recordings, adjoint: diffrax.AbstractAdjoint | None = None) -> Way:
+    """The sum of squared residuals in units of the noise, as a function of the parameters."""
+    simulated = simulation(recs, adjoint)
+    tau = np.stack([r.tau for r in recs])
+    return lambda theta: jnp.sum(((tau - simulated(theta)) / NOISE) ** 2)
 
 
-def _residual(recs: jaxid.Recordings, loop: jaxid.ClosedLoop, theta: jax.Array) -> np.ndarray:
-    runs = jaxid.simulate(loop.with_theta(theta), recs)
-    return np.stack([r.tau - run.tau for r, run in zip(recs, runs, strict=True)])
+def gradient(way: str, recs: jaxid.Recordings) -> Way:
+    """The gradient of the squared error as a function of the parameters.
+
+    For the simulation alone it is the squared error itself.
+    """
+    if way in ADJOINTS:
+        forward = isinstance(ADJOINTS[way], diffrax.ForwardMode)
+        return (jax.jacfwd if forward else jax.grad)(squared_error(recs, ADJOINTS[way]))
+    if way == OURS:
+        asked = minimisers.posed(recs)
+        _, start = minimisers.starts(asked)
+        return lambda th: 2 * point_around(asked, th, jnp.asarray(start)).sums.slope.sum(axis=0)
+    loss = squared_error(recs)
+    if way == ALONE:
+        return loss
+    return _two_point(loss) if way == TWO_POINT else _three_point(loss)
 
 
-def success(recs: jaxid.Recordings, draws: int) -> list[dict[str, Any]]:
-    """Iterations and success of SciPy's least squares with each Jacobian."""
-    jacobians, _ = ways(recs, cad())
-    batch = prepare(cad(), recs)
-    measured = np.asarray(batch.tau)
+def _two_point(loss: Way) -> Way:
+    def found(theta: Theta) -> Array:
+        h = 1e-6 * jnp.maximum(jnp.abs(theta), 0.1)
+        # One program for all points, or the compiler would see each as another simulation.
+        values = jax.lax.map(loss, jnp.concatenate([theta[None], theta + jnp.diag(h)]))
+        return (values[1:] - values[0]) / h
 
-    @jax.jit
-    def torque(theta):
-        changed = cad().with_theta(theta)
-        return each(
-            lambda i, q, v: run(changed, i, initial(changed, i, q, v))[1][:, 0],
-            batch.intervals,
-            batch.q0,
-            batch.v0,
-        )
+    return found
 
-    rng = np.random.default_rng(1)
-    start = np.maximum(np.asarray(cad().theta), 1e-3)
-    spread = np.array([1.0, 0.2, 0.2, 0.2, 0.1, 0.5, 0.05, 0.2])
-    random = start + spread * rng.uniform(-1, 1, (draws, P))
-    low = np.array([0.1, 0.01, -np.inf, -np.inf, 0, 0, 0, 0])
-    rows = []
-    for name, way in jacobians.items():
-        slope = jax.jit(way)
 
-        def solve(x0, slope=slope):
-            return optimize.least_squares(
-                lambda th: np.nan_to_num((np.asarray(torque(th)) - measured).ravel(), nan=1e6),
-                np.maximum(x0, low + 1e-6),
-                jac=lambda th: np.nan_to_num(np.asarray(slope(th)).reshape(-1, P)),
-                x_scale="jac",
-                bounds=(low, np.inf),
-                max_nfev=60,
-            )
+def _three_point(loss: Way) -> Way:
+    def found(theta: Theta) -> Array:
+        h = 1e-5 * jnp.maximum(jnp.abs(theta), 0.1)
+        values = jax.lax.map(loss, jnp.concatenate([theta + jnp.diag(h), theta - jnp.diag(h)]))
+        return (values[: len(h)] - values[len(h) :]) / (2 * h)
 
-        floor = NOISE**2 * measured.size / 2
-        runs = [solve(start), *(solve(x0) for x0 in random)]
-        reached = [r.cost < 1.05 * floor for r in runs]
-        rows.append(
-            {
-                "task": "least squares",
-                "recordings": len(recs),
-                "way": name,
-                "from_CAD": bool(reached[0]),
-                "CAD_iterations": runs[0].njev,
-                "random_starts": draws,
-                "reached": int(sum(reached[1:])),
-                "median_iterations": float(
-                    np.median([r.njev for r, ok in zip(runs[1:], reached[1:], strict=True) if ok])
-                    if any(reached[1:])
-                    else np.nan
-                ),
-            }
-        )
-    return rows
+    return found
+
+
+def place() -> np.ndarray:
+    """Where gradients are taken, `(parameters,)`."""
+    return 1.05 * np.array(list(TRUTH.values()))
+
+
+def extrapolated(recs: jaxid.Recordings, levels: int = 6) -> tuple[np.ndarray, float]:
+    """The gradient from central differences at steps that shrink by four (Ridders 1982).
+
+    Differences are of the torque, which has more digits than its squared error. Of each column's
+    extrapolations the one that differs least from its neighbours counts.
+
+    **Returns:** the gradient, `(parameters,)`, and how far those neighbours are, relative to it.
+    """
+    theta, simulated = place(), simulation(recs, None)
+    steps = 0.01 * theta * 4.0 ** -np.arange(levels)[:, None]
+    shifts = steps[..., None] * np.eye(len(theta))
+    points = np.stack([theta + shifts, theta - shifts]).reshape(-1, len(theta))
+    points = jnp.asarray(np.concatenate([theta[None], points]))
+    torque = np.asarray(jax.jit(lambda all_: jax.lax.map(simulated, all_))(points))
+    measured = np.stack([r.tau for r in recs])
+    plus, minus = torque[1:].reshape(2, levels, len(theta), *measured.shape)
+    residual = (measured - torque[0]) / NOISE**2
+    # Of the torque to its inner product with the residual: all that follows is linear in it.
+    slopes = np.einsum("lprkj,rkj->lp", plus - minus, -2 * residual) / (2 * steps)
+    found = [_ridders(column) for column in slopes.T]
+    best, gap = np.transpose(found)
+    return best, float(np.linalg.norm(gap) / np.linalg.norm(best))
+
+
+def _ridders(slopes: Float[np.ndarray, " levels"]) -> tuple[float, float]:
+    rows, best, error = [[slopes[0]]], slopes[0], np.inf
+    for slope in slopes[1:]:
+        row, before = [slope], rows[-1]
+        for j, former in enumerate(before, start=1):
+            row.append(row[-1] + (row[-1] - former) / (16.0**j - 1))
+            gap = max(abs(row[-1] - row[-2]), abs(row[-1] - former))
+            if gap < error:
+                best, error = row[-1], gap
+        rows.append(row)
+    return best, error
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One way's turn: which, along which recordings, and how often it runs warm."""
+
+    way: str
+    recordings: jaxid.Recordings
+    repeats: int
+
+
+def measured(job: Job) -> dict[str, Any]:
+    """One row but for what it takes a reference to say."""
+    theta, found = jnp.asarray(place()), jax.jit(gradient(job.way, job.recordings))
+    compiled = functools.cache(lambda: found.lower(theta).compile())
+    value, cold, warm = cold_and_warm(lambda: compiled()(theta), job.repeats)
+    memory = compiled().memory_analysis()
+    return {
+        "way": job.way,
+        "gradient": np.asarray(value),
+        "cold_s": cold,
+        "warm_ms": 1e3 * warm,
+        "memory_MiB": peak_memory(),
+        "buffers_MiB": memory.temp_size_in_bytes / 2**20 if memory else np.nan,
+    }
+
+
+def table(
+    recs: jaxid.Recordings, ways: tuple[str, ...], repeats: int, at_once: int = 1
+) -> pd.DataFrame:
+    """A row for each of some ways to the gradient; the simulation alone is one of them."""
+    rows = each_afresh(measured, [Job(way, recs, repeats) for way in ways], at_once)
+    exact, uncertain = extrapolated(recs)
+    print(f"the reference gradient is known to {uncertain:.0e} of itself")
+    found = pd.DataFrame(rows).set_index("way")
+    gradients = found.pop("gradient").drop(ALONE)
+    gaps = gradients.map(lambda g: np.linalg.norm(g - exact) / np.linalg.norm(exact))
+    found.insert(0, "error", gaps)
+    found["memory_MiB"] -= found.loc[ALONE, "memory_MiB"]
+    return found
 
 
 def main() -> None:
-    """Prints both tables as one."""
+    """Prints both tables, and writes them as one."""
     given = options(__doc__)
-    seconds, many, draws, budget = (2.0, 2, 2, 2.0) if given.quick else (20.0, 16, 50, 40.0)
+    seconds, repeats, at_once = (2.0, 1, 2) if given.quick else (20.0, 20, 1)
+    recs = recordings(1, seconds)
     print(machine())
-    rows = table(recordings(1, seconds), budget)
-    if not given.quick:
-        rows += table(recordings(many, seconds), budget)
-    rows += success(recordings(1 if given.quick else 2, seconds), draws)
-    report(pd.DataFrame(rows).set_index(["task", "recordings", "way"]), given.json, form=".6f")
+    who, ways = (minimisers.FEW, FEW) if given.quick else (minimisers.MINIMISERS, WAYS)
+    fits = minimisers.table(recs, who, max(1, repeats // 4), at_once)
+    show(fits, form=".3g")
+    gradients = table(recs, ways, repeats, at_once)
+    show(gradients, form=".3g")
+    write([*records(fits, task="fit"), *records(gradients, task="gradient")], given.json)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,10 @@ from jaxid.control import ComputedTorque
 from jaxid.display import figures
 from jaxid.excitation import Excitation
 from jaxid.signals.fourier import FourierSeries
-from jaxid.simulation.runs import initial, prepare, run, run_with_sensitivities, with_substeps
+from jaxid.simulation.batch import prepare
+from jaxid.simulation.integration import initial
+from jaxid.simulation.runs import run, run_with_sensitivities
+from jaxid.simulation.steps import with_substeps
 
 from ._output import report
 
@@ -139,7 +142,7 @@ class Chord(eqx.Module):
 
         def residual(theta, measured):
             at = self.loop.with_theta(theta)
-            _, seen = run(at, self.intervals, initial(at, self.intervals, *self.starts))
+            _, seen, _ = run(at, self.intervals, initial(at, self.intervals, *self.starts))
             return measured - seen[:, 0]
 
         def one(measured):
@@ -167,7 +170,7 @@ def chord(series: FourierSeries, runs: sim.Batch, part: slice = FROM_REST) -> Ch
     starts = jnp.asarray(np.asarray(series(np.zeros(1)))[:2, 0])
     x0 = initial(model, intervals, *starts)
     zero = jnp.zeros((len(x0), len(model.theta)))
-    _, by = run_with_sensitivities(model, intervals, x0, zero, (0,))
+    by = run_with_sensitivities(model, intervals, x0, zero, (0,)).slopes
     return Chord(model, intervals, starts, by[:, 0])
 
 

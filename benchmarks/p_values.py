@@ -24,7 +24,8 @@ from scipy import stats
 import jaxid
 from tests import independent as sim
 
-from .hidden_effects import COLOURS, configure_jax
+from ._hidden_cases import COLOURS
+from .hidden_effects import configure_jax
 
 FITTING = ("fit_1", "fit_2")
 QUANTILES = (0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9)

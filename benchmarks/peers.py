@@ -29,8 +29,10 @@ import pandas as pd
 from scipy import integrate, optimize
 
 import jaxid
-from jaxid.estimate.minimise.problem import linearisation, point_around
-from jaxid.simulation.runs import each, initial, prepare, run
+from jaxid.estimate.minimise import linearisation, point_around
+from jaxid.simulation.batch import prepare
+from jaxid.simulation.integration import initial
+from jaxid.simulation.runs import each, run
 
 from ._output import options, report
 from ._problem import (

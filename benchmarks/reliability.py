@@ -220,8 +220,8 @@ def _recording_bootstrap(fit: jaxid.Fit, draws: int) -> np.ndarray:
 def _normal_equations(fit: jaxid.Fit, recording: jaxid.Recording) -> tuple[np.ndarray, np.ndarray]:
     import jax.numpy as jnp
 
-    from jaxid.estimate.minimise.problem import sensitivity
-    from jaxid.simulation.runs import prepare
+    from jaxid.estimate.minimise import sensitivity
+    from jaxid.simulation.batch import prepare
 
     one = jaxid.Recordings.of(recording)
     batch = prepare(fit.loop, one)

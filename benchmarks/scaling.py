@@ -20,8 +20,8 @@ import pandas as pd
 import jaxid
 from jaxid.discovery.linear import linearise as linear_system
 from jaxid.discovery.linear import respond
-from jaxid.estimate.minimise.problem import linearisation
-from jaxid.simulation.runs import Batch, prepare
+from jaxid.estimate.minimise import linearisation
+from jaxid.simulation.batch import Batch, prepare
 
 from ._output import options, report
 from ._problem import SUBSTEPS, cad, interleaved, machine, problem, recordings, truth
@@ -134,26 +134,6 @@ def shared(seconds: float, count: int) -> None:
     print(json.dumps({"ms": 1e3 * best, "us_per_step": 1e6 * best / SUBSTEPS / batch.mask.size}))
 
 
-def peak(seconds: float) -> dict[str, Any]:
-    """Largest resident memory of a process that fits one recording of this length."""
-    # Not what `resource` says: that counts what this process held when it started the other.
-    code = (
-        "import jaxid; from benchmarks._problem import cad, recordings; "
-        f"fit = jaxid.fit(cad(), recordings(1, {seconds})); "
-        "lines = open('/proc/self/status').read().splitlines(); "
-        "print(fit.succeeded, *[l.split()[1] for l in lines if l.startswith('VmHWM')])"
-    )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    succeeded, size = out.stdout.split()[-2:]
-    return {
-        "grows": "whole fit",
-        "recordings": 1,
-        "seconds": seconds,
-        "succeeded": succeeded == "True",
-        "peak_MiB": int(size) / 1024,
-    }
-
-
 def main() -> None:
     """Prints one table."""
     given = options(__doc__)
@@ -171,7 +151,6 @@ def main() -> None:
     rows += hypotheses(one, (1, 10) if quick else (1, 10, 100, 500), budget)
     if not quick:
         rows += devices(length, 64)
-        rows += [peak(s) for s in (20.0, 1000.0)]
     report(pd.DataFrame(rows).set_index("grows"), given.json)
 
 

@@ -16,10 +16,11 @@ import numpy as np
 import pandas as pd
 
 import jaxid
-from jaxid.discovery.signatures import candidates
-from jaxid.estimate.minimise.problem import sensitivity
-from jaxid.estimate.oem import pieces_of
-from jaxid.simulation.runs import prepare, with_substeps
+from jaxid.discovery.hypotheses import candidates
+from jaxid.estimate.minimise import sensitivity
+from jaxid.estimate.pieces import pieces_of
+from jaxid.simulation.batch import prepare
+from jaxid.simulation.steps import with_substeps
 from tests import independent as sim
 
 from ._output import options, report

@@ -19,8 +19,9 @@ from jaxid import effects as fx
 from jaxid.errors import FitError
 from jaxid.estimate.regression import decimator, filtered, linear_parameters, regression
 from jaxid.parameters import list_parameters, read_values, write_values
-from jaxid.simulation.loop import inverse
-from jaxid.simulation.runs import Simulated, recording_label
+from jaxid.simulation.batch import recording_label
+from jaxid.simulation.dynamics import inverse
+from jaxid.simulation.runs import Simulated
 
 Key = tuple[str, int | None]
 # A column of which the others leave less than this share says nothing.

@@ -1,8 +1,9 @@
 """Identify robot arms from closed-loop recordings, and find the physical effect the model lacks."""
 
 import gc as _gc
-import os as _os
-from importlib.util import find_spec as _find_spec
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+from typing import Any as _Any
 
 # JAX hangs a callback on the garbage collector, in which a Ctrl-C gets lost. Importing takes
 # seconds, and nothing of it is garbage.
@@ -12,30 +13,13 @@ _gc.disable()
 import jax as _jax  # noqa: E402
 
 _jax.config.update("jax_enable_x64", True)
-# XLA's CPU runtime calls one kernel for each operation of a loop's body, which takes five times as
-# long as the physics of a few joints. Below this size it compiles the whole loop as one kernel; its
-# own limit, 1 kB, is below any robot's. With LLVM's first level of optimisation programs compile in
-# two thirds of the time and run as fast; accelerators keep theirs. Nothing happens where the user
-# has settings of their own, and results are the same either way.
-_flags = {"xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=16777216"}
-if _find_spec("jax_plugins") is None:
-    _flags["xla_backend_optimization_level"] = "1"
-for _name, _value in _flags.items():
-    if _name not in _os.environ.get("XLA_FLAGS", ""):
-        _given = _os.environ.get("XLA_FLAGS", "")
-        _os.environ["XLA_FLAGS"] = f"{_given} --{_name}={_value}".strip()
+from .compiling import set_loop_threshold as _set_loop_threshold  # noqa: E402
+
+_set_loop_threshold()
 
 from . import arms as arms  # noqa: E402
 from . import control as control  # noqa: E402
 from . import effects as effects  # noqa: E402
-from . import excitation as excitation  # noqa: E402
-from .discovery import Comparison as Comparison  # noqa: E402
-from .discovery import Diagnosis as Diagnosis  # noqa: E402
-from .discovery import Discovery as Discovery  # noqa: E402
-from .discovery import compare as compare  # noqa: E402
-from .discovery import diagnose as diagnose  # noqa: E402
-from .discovery import discover as discover  # noqa: E402
-from .discovery import next_experiment as next_experiment  # noqa: E402
 from .effects import Curve as Curve  # noqa: E402
 from .effects import catalogue as catalogue  # noqa: E402
 from .estimate import DIDIM as DIDIM  # noqa: E402
@@ -59,10 +43,6 @@ from .estimate import deviations as deviations  # noqa: E402
 from .estimate import fit as fit  # noqa: E402
 from .estimate import profile as profile  # noqa: E402
 from .estimate import with_deviations as with_deviations  # noqa: E402
-from .excitation import Excitation as Excitation  # noqa: E402
-from .excitation import Limits as Limits  # noqa: E402
-from .excitation import PlanarReach as PlanarReach  # noqa: E402
-from .excitation import optimal_excitation as optimal_excitation  # noqa: E402
 from .parameters import parameter as parameter  # noqa: E402
 from .recording import Recording as Recording  # noqa: E402
 from .recording import Recordings as Recordings  # noqa: E402
@@ -81,3 +61,49 @@ if _collecting:
     _gc.freeze()
     _gc.unfreeze()
     _gc.enable()
+
+if _TYPE_CHECKING:
+    from . import excitation as excitation
+    from .discovery import Comparison as Comparison
+    from .discovery import Diagnosis as Diagnosis
+    from .discovery import Discovery as Discovery
+    from .discovery import compare as compare
+    from .discovery import diagnose as diagnose
+    from .discovery import discover as discover
+    from .discovery import next_experiment as next_experiment
+    from .excitation import Excitation as Excitation
+    from .excitation import Limits as Limits
+    from .excitation import PlanarReach as PlanarReach
+    from .excitation import optimal_excitation as optimal_excitation
+    from .report import write_report as write_report
+
+# The rooms of the upper floors come with the first name that is asked of them: a program that
+# simulates and fits does without, and they are a third of what there is to import.
+_LATER = {
+    "discovery": (
+        "Comparison",
+        "Diagnosis",
+        "Discovery",
+        "compare",
+        "diagnose",
+        "discover",
+        "next_experiment",
+    ),
+    "excitation": ("Excitation", "Limits", "PlanarReach", "optimal_excitation"),
+    "report": ("write_report",),
+}
+_ROOM_OF = {name: room for room, names in _LATER.items() for name in names}
+
+
+def __getattr__(name: str) -> _Any:
+    if name in _LATER:
+        return _import_module(f".{name}", __name__)
+    if name not in _ROOM_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(_import_module(f".{_ROOM_OF[name]}", __name__), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LATER, *_ROOM_OF})

@@ -1,9 +1,13 @@
 """What jaxid raises and warns with: every message is one sentence that says what to do."""
 
+import dataclasses
+import difflib
 import importlib
+import reprlib
 import textwrap
+from collections.abc import Iterable
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 
 class JaxidError(Exception):
@@ -66,6 +70,20 @@ def _printable(text: str) -> str:
     return "".join(character if character.isprintable() else " " for character in text)
 
 
+def brief(value: object) -> str:
+    """`repr`, short enough for a sentence."""
+    short = reprlib.Repr()
+    short.maxlist, short.maxstring, short.maxother = 8, 24, 40
+    return short.repr(value)
+
+
+def near(name: str, candidates: Iterable[str]) -> str:
+    """` (did you mean 'x'?)` when a candidate comes close to `name`, else nothing."""
+    by_folded = {candidate.casefold(): candidate for candidate in candidates}
+    close = difflib.get_close_matches(name.casefold(), list(by_folded), n=1, cutoff=0.7)
+    return f" (did you mean {brief(by_folded[close[0]])}?)" if close else ""
+
+
 def require(module: str, extra: str) -> ModuleType:
     """Imports a module that only an extra installs.
 
@@ -82,3 +100,28 @@ def require(module: str, extra: str) -> ModuleType:
         raise MissingExtraError(
             f"{module} cannot be imported ({error}): pip install 'jaxid-robotics[{extra}]'"
         ) from error
+
+
+def check_words(settings: Any) -> None:
+    """Refuses a word that is none of those which a field's `Literal` lists.
+
+    **Arguments:**
+
+    - `settings`: a dataclass.
+
+    **Raises:** `FitError` that names the field and its words.
+    """
+    for field in dataclasses.fields(settings):
+        words, value = _words(field.type), getattr(settings, field.name)
+        if words and isinstance(value, str) and value not in words:
+            raise FitError(
+                f"{field.name}={value!r} of {type(settings).__name__} is none of "
+                f"{', '.join(map(repr, words))}{near(value, words)}"
+            )
+
+
+def _words(annotation: Any) -> tuple[str, ...]:
+    """The strings of a `Literal`, also of one among others in a union."""
+    if get_origin(annotation) is Literal:
+        return tuple(word for word in get_args(annotation) if isinstance(word, str))
+    return tuple(word for part in get_args(annotation) for word in _words(part))

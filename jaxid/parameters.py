@@ -77,6 +77,10 @@ def parameter(
 KNOWN = MappingProxyType({"known": True})
 
 
+# Attributes and tuple indices from a model to a field of it.
+Place: TypeAlias = tuple[str | int, ...]
+
+
 class Parameter(eqx.Module):
     """One parameter of a model: its declaration, its unique name and where it lives.
 
@@ -92,6 +96,11 @@ class Parameter(eqx.Module):
     several: bool = eqx.field(static=True, default=False)
 
     @property
+    def place(self) -> Place:
+        """Where it lives: the attributes and tuple indices that lead to it."""
+        return self.where.steps  # type: ignore[attr-defined]
+
+    @property
     def names(self) -> list[str]:
         """One name for each value."""
         if not self.several:
@@ -101,13 +110,15 @@ class Parameter(eqx.Module):
 
 def sliding_unit(unit: str) -> str:
     """The unit of a parameter declared for a turning joint when its joint slides: N·m to N."""
-    return unit.replace("N·m", "N").replace("rad", "m").replace("kg·m²", "kg")
+    unit = unit.replace("N·m", "N").replace("rad", "m").replace("kg·m²", "kg")
+    # Brackets around one unit alone say nothing: m/(N) is m/N.
+    return re.sub(r"\((\w+)\)", r"\1", unit)
 
 
 class _Path(eqx.Module):
     """Walks attributes and tuple indices; hashable, so that it can be static."""
 
-    steps: tuple[str | int, ...] = eqx.field(static=True)
+    steps: Place = eqx.field(static=True)
 
     def __call__(self, tree: Any) -> Any:
         for step in self.steps:
@@ -115,7 +126,7 @@ class _Path(eqx.Module):
         return tree
 
 
-def _declared(module: Any, steps: tuple[str | int, ...]) -> Iterator[tuple[Any, str, _Path]]:
+def _declared(module: Any, steps: Place) -> Iterator[tuple[Any, str, _Path]]:
     if isinstance(module, (tuple, list)):
         for k, item in enumerate(module):
             yield from _declared(item, (*steps, k))
@@ -142,17 +153,19 @@ def _listed(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Parame
     """The parameters of modules of one structure: a fit asks for them dozens of times."""
     model = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(s, float) for s in shapes])
     found: list[Parameter] = []
-    taken: dict[str, int] = {}
+    taken: set[str] = set()
     for owner, field, where in _declared(model, ()):
         value = getattr(owner, field)
         if value is None:
             continue
         declaration = type(owner).__dataclass_fields__[field].metadata["parameter"]
         joint = getattr(owner, "joint", None)
-        name = declaration.symbol + ("" if joint is None else str(joint))
-        taken[name] = taken.get(name, 0) + 1
-        if taken[name] > 1:
-            name = f"{name}_{taken[name]}"
+        symbol = declaration.symbol + ("" if joint is None else str(joint))
+        name, number = symbol, 1
+        while name in taken:
+            number += 1
+            name = f"{symbol}_{number}"
+        taken.add(name)
         found.append(
             Parameter(name, declaration, where, joint, math.prod(value.shape), bool(value.shape))
         )

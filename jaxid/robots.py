@@ -48,4 +48,4 @@ def emps(controller: AbstractController | None = None) -> ClosedLoop:
     effects = (*friction, TorqueOffset(joint=1))
     # At these speeds the sign's sharpness shows in the force, and nobody knows it: fits find it.
     law = controller or Cascade()
-    return ClosedLoop(Axis(), law, effects, name="emps", freed=frozenset({"gamma1"}))
+    return ClosedLoop(Axis(), law, effects, name="emps").free("gamma1")

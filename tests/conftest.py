@@ -28,6 +28,9 @@ jaxtyping.install_import_hook(
     "jaxid", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
 )
 
+# After the hook, for it imports jaxid: fixtures that tests of several files share.
+from stories import bump_case, bump_story, offset_case, offset_story, small_fit  # noqa: E402, F401
+
 SHARED_DATA = Path(__file__).parents[1].parent / "shared" / "data"
 
 

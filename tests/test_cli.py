@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 
 import jaxid
 import jaxid.discovery
-from jaxid.cli import _with_fitted, app, load_robot
+from jaxid.cli import app
+from jaxid.cli.models import load_robot, with_fitted
 from jaxid.errors import ModelError
 
 DEMO = Path(jaxid.__file__).parent / "demo" / "clean"
@@ -85,7 +86,7 @@ def test_a_robot_of_ones_own(tmp_path):
     file = tmp_path / "my_robot.py"
     file.write_text(OWN_ROBOT)
     for name in ("loop", "make"):
-        assert "MY2" in load_robot(f"{file}:{name}").held
+        assert "MY2" in load_robot(f"{file}:{name}").held_names
     result = run("fit", FIT_1, "--robot", f"{file}:loop", "--method", "idim")
     assert result.exit_code == 0
     assert "MX2" in result.stdout
@@ -186,7 +187,7 @@ def test_vectors_come_back_from_a_file_of_fitted_parameters(tmp_path):
     values = {name: 0.01 * k for k, name in enumerate(loop.names, start=1)}
     found = {"parameters": {name: {"value": value} for name, value in values.items()}}
     path.write_text(json.dumps(found))
-    assert np.allclose(_with_fitted(loop, path).theta, list(values.values()))
+    assert np.allclose(with_fitted(loop, path).theta, list(values.values()))
 
 
 def test_demo_tells_both_stories_on_files_that_are_shipped(monkeypatch):

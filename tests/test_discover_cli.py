@@ -13,7 +13,9 @@ from typer.testing import CliRunner
 
 import jaxid
 import jaxid.discovery
-from jaxid.cli import app, load_effect, spread
+from jaxid.cli import app
+from jaxid.cli.discovering import spread
+from jaxid.cli.models import load_effect
 
 # What one worker has fitted serves all of them.
 pytestmark = pytest.mark.xdist_group("demo")

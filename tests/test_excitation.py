@@ -8,10 +8,11 @@ import pytest
 
 import jaxid
 from jaxid.errors import FitError, LimitsError
-from jaxid.excitation import optimal
 from jaxid.excitation._information import Settings, closed_loop_columns, torque_along
+from jaxid.excitation.descent import random_references
+from jaxid.excitation.design import feasible_share, make_design, score_and_slope, score_of
 from jaxid.signals.fourier import fourier_basis
-from jaxid.simulation.runs import set_substeps
+from jaxid.simulation.steps import set_substeps
 
 TRUE = sim.TwoLink(gamma=20.0)
 TRUTH = {name: getattr(TRUE, name) for name in TRUE.base}
@@ -68,7 +69,7 @@ def test_it_starts_and_ends_at_rest(found):
 
 
 def test_it_starts_where_asked():
-    design, centre = optimal.make_design(
+    design, centre = make_design(
         loop(), limits(), period=4.0, harmonics=3, rate=100.0, start=[0.4, 0.9]
     )
     z = centre + np.random.default_rng(0).normal(size=centre.shape)
@@ -82,10 +83,10 @@ def test_it_starts_where_asked():
 
 
 def test_it_beats_random_references_and_its_deviations_are_those_of_the_regressor(found):
-    design, centre = optimal.make_design(
+    design, centre = make_design(
         loop(), limits(workspace=REACH), period=4.0, harmonics=5, rate=200.0
     )
-    _, scores = optimal.random_references(design, centre, 200, seed=5)
+    _, scores = random_references(design, centre, 200, seed=5)
     # By 20 % in the root of the determinant, of 200 (benchmarks/excitation has 1000).
     assert found.score < scores.min() + np.log(0.8)
     r = found.reference(rate=200.0)
@@ -122,19 +123,17 @@ def sampled_loop():
     ],
 )
 def test_gradients_are_those_of_differences(model, kind, criterion):
-    design, centre = optimal.make_design(
+    design, centre = make_design(
         model(), limits(), period=2.0, harmonics=2, rate=50.0, kind=kind, criterion=criterion
     )
     rng = np.random.default_rng(1)
     z = jnp.asarray(centre + rng.normal(size=centre.shape))
-    _, slope = optimal._score_and_slope(design, z)
+    _, slope = score_and_slope(design, z)
     along = jnp.asarray(rng.normal(size=centre.shape))
     h = 1e-3
 
     def central(h):
-        return (optimal._score(design, z + h * along) - optimal._score(design, z - h * along)) / (
-            2 * h
-        )
+        return (score_of(design, z + h * along) - score_of(design, z - h * along)) / (2 * h)
 
     expected = (4 * central(h / 2) - central(h)) / 3
     assert abs(float(slope @ along) / float(expected) - 1) < 1e-5
@@ -158,13 +157,13 @@ def test_criteria_are_what_they_are_called():
 def test_a_reference_that_keeps_its_limits_is_not_drawn_in():
     # Half as large a motion would pass the workspace, whose middle is out of bounds.
     ring = jaxid.Limits(**ROOM | {"torque": [60, 20], "workspace": lambda q: q[:1] ** 2 - 0.2})
-    design, _ = optimal.make_design(loop(), ring, period=4.0, harmonics=2, rate=100.0)
+    design, _ = make_design(loop(), ring, period=4.0, harmonics=2, rate=100.0)
     still = np.array([[0.9, 0.0]] + [[0.0, 0.0]] * 4)
     there, opposite = (
         jnp.asarray(np.linalg.lstsq(design.span, pose, rcond=None)[0].ravel())
         for pose in (still, -still)
     )
-    share = optimal._feasible_share(design, opposite, there)
+    share = feasible_share(design, opposite, there)
     assert float(share) == 1.0
 
 

@@ -4,18 +4,15 @@ import dataclasses
 from typing import Literal
 
 import independent as sim
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import optimize
 
 import jaxid
 from jaxid.control import OpenLoop, Tracking
 from jaxid.effects import EncoderEccentricity, Hysteresis, JointElasticity, TorqueOffset, Viscous
-from jaxid.errors import FitError, RecordingError
-from jaxid.estimate.minimise import problem as ls
+from jaxid.errors import FitError, RecordingError, _words, check_words
+from jaxid.estimate.minimise import linearising
 from jaxid.estimate.result import determined_covariance
-from jaxid.settings import _words, check_words
 
 # What one worker has fitted serves all of them.
 pytestmark = pytest.mark.xdist_group("fit")
@@ -150,13 +147,13 @@ def test_position_as_output(cases, output):
 
 def test_bounds_hold_in_every_iterate(lacking, monkeypatch):
     seen = []
-    original = ls.point_around
+    original = linearising.point_around
 
     def spy(problem, theta, start):
         seen.append((np.asarray(theta), np.asarray(problem.lower), np.asarray(problem.upper)))
         return original(problem, theta, start)
 
-    monkeypatch.setattr(ls, "point_around", spy)
+    monkeypatch.setattr(linearising, "point_around", spy)
     fit = jaxid.fit(jaxid.scara(), both(lacking))
     assert len(seen) > 3
     assert all(np.all((low <= x) & (x <= high)) for x, low, high in seen)
@@ -321,62 +318,6 @@ def test_white_deviations_are_the_papers_formula(cases, fits):
     assert np.allclose(fit.theta, fits[0].theta, atol=0.03 * fits[0].std.min())
     assert np.all(fit.std > 0)
     assert not np.allclose(fit.std, fits[0].std, rtol=0.05)
-
-
-# --- the minimiser, against dense linear algebra and SciPy ----------------------------------------
-
-
-def random_point(rng, recordings=3, rows=20, p=4, initials=2):
-    """A point with random derivatives, as the minimiser sees it, and these."""
-    r = rng.standard_normal((recordings, rows))
-    j = rng.standard_normal((recordings, rows, p)) * [1.0, 30.0, 0.1, 5.0]
-    s = rng.standard_normal((recordings, rows, initials)) * [1.0, 10.0][:initials]
-    point = ls.Point(
-        jnp.zeros(p),
-        jnp.zeros((recordings, initials)),
-        ls.Sensitivity(*(jnp.zeros((1, 1, 1)),) * 2, jnp.zeros((1, 1, 1, p)), None),
-        jnp.sum(r**2),
-        jnp.einsum("rkp,rkq->pq", j, j),
-        jnp.einsum("rkp,rk->p", j, r),
-        jnp.einsum("rka,rkb->rab", s, s),
-        jnp.einsum("rka,rk->ra", s, r),
-        jnp.einsum("rka,rkp->rap", s, j),
-    )
-    wide = np.zeros((recordings, rows, p + recordings * initials))
-    wide[..., :p] = j
-    for k in range(recordings):
-        wide[k, :, p + k * initials : p + (k + 1) * initials] = s[k]
-    return point, wide.reshape(-1, wide.shape[-1]), r.reshape(-1)
-
-
-def stub(p, lower=-np.inf, upper=np.inf):
-    """What a step needs to know of a problem."""
-    problem = object.__new__(ls.Problem)
-    object.__setattr__(problem, "lower", jnp.full(p, lower))
-    object.__setattr__(problem, "upper", jnp.full(p, upper))
-    return problem
-
-
-def test_eliminating_initial_states_gives_the_dense_step(monkeypatch):
-    point, wide, r = random_point(np.random.default_rng(0))
-    step, start, gain = ls._step(stub(4), point, ls._Scales.of(point), 0.1)
-    damped = wide.T @ wide + 0.1 * np.diag(np.sum(wide**2, axis=0))
-    dense = -np.linalg.solve(damped, wide.T @ r)
-    assert np.allclose(step, dense[:4])
-    assert np.allclose(start.reshape(-1), dense[4:])
-    # The promise is the quadratic model's, exactly.
-    assert np.isclose(gain, np.sum(r**2) - np.sum((r + wide @ dense) ** 2))
-
-
-def test_a_step_into_bounds_is_the_best_within_them():
-    for seed in range(20):
-        point, wide, r = random_point(np.random.default_rng(seed), initials=0)
-        step, _, gain = ls._step(stub(4, -0.02, 0.02), point, ls._Scales.of(point), 1e-10)
-        best = optimize.lsq_linear(wide, -r, (-0.02, 0.02), tol=1e-12)
-        promised = np.sum(r**2) - 2 * best.cost
-        assert np.all(np.abs(step) <= 0.02)
-        # Freezing what overshoots is not an exact quadratic program, but most of one.
-        assert 0.8 * promised <= gain <= promised * (1 + 1e-6)
 
 
 def test_derivatives_that_overflow_give_no_deviations():

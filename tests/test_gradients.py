@@ -19,16 +19,11 @@ from jaxid.arms import Axis
 from jaxid.control import PD, Cascade, OpenLoop, Sampled, Tracking
 from jaxid.effects import AbstractEffect, Coulomb, Viscous
 from jaxid.recording import Recordings
+from jaxid.simulation.batch import prepare
+from jaxid.simulation.integration import SIGNALS, initial
 from jaxid.simulation.loop import ClosedLoop
-from jaxid.simulation.runs import (
-    SIGNALS,
-    initial,
-    prepare,
-    run,
-    run_with_sensitivities,
-    set_substeps,
-    with_substeps,
-)
+from jaxid.simulation.runs import run, run_with_sensitivities
+from jaxid.simulation.steps import set_substeps, with_substeps
 
 ROWS = tuple(SIGNALS.index(name) for name in ("tau", "q", "v", "delivered"))
 FINE = 32
@@ -70,7 +65,8 @@ class Problem:
         p, n = len(self.theta), len(self.x0)
         start = jnp.concatenate([jnp.zeros((n, p)), jnp.eye(n)], axis=1)
         loop = self.loop.with_theta(z[:p])
-        return run_with_sensitivities(loop, self.intervals, z[p:], start, ROWS)
+        found = run_with_sensitivities(loop, self.intervals, z[p:], start, ROWS)
+        return found.seen, found.slopes
 
     @property
     def z(self):

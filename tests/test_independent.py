@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from independent import effects as fx
 from independent.draws import ROBOTS
+from independent.loop import Loop
 from independent.plants import solve_accelerations
 from independent.references import onset, trapezoid_move
-from independent.simulate import Loop
 
 EVERY = sim.CATALOGUE + sim.OUTSIDE
 REFERENCE = sim.draw_multisine(np.random.default_rng(7), 6.0, bands=((0.1, 0.5), (0.15, 1.2)))

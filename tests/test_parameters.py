@@ -74,6 +74,17 @@ def test_two_of_the_same_are_numbered_and_apart():
     assert (values["Fv2"], values["Fv2_2"], values["Fv2_3"]) == (0.0, 0.7, 0.3)
 
 
+class _Numbered(AbstractEffect):
+    """A symbol that another's number would make."""
+
+    own: Scalar = parameter(0.0, symbol="Fv1_2", unit="N·m")
+
+
+def test_a_number_gives_no_name_that_is_taken():
+    box = Box(things=(Viscous(joint=1), _Numbered(), Viscous(joint=1)))
+    assert [p.name for p in list_parameters(box)] == ["Fv1", "Fv1_2", "Fv1_3", "size"]
+
+
 def test_nested_modules_and_tuples_are_walked():
     box = Box(things=(Viscous(joint=1), (Curve(joint=2), Tilt(pull=1.5))))
     assert [p.name for p in list_parameters(box)] == ["Fv1", "height2", "pull", "size"]
@@ -120,6 +131,8 @@ def test_units_of_joints_that_slide():
     assert sliding_unit("N·m·s/rad") == "N·s/m"
     assert sliding_unit("N·m") == "N"
     assert sliding_unit("kg·m²") == "kg"
+    assert sliding_unit("rad/(N·m)") == "m/N"
+    assert sliding_unit("N·m/(rad/s)") == "N/(m/s)"
     loop = jaxid.emps()
     units = {p.name: loop.unit(p) for p in loop.parameters}
     assert units == {"M": "kg", "Fv1": "N·s/m", "Fc1": "N", "gamma1": "s/m", "offset1": "N"}

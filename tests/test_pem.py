@@ -11,7 +11,7 @@ import pytest
 
 import jaxid
 from jaxid.errors import FitError, NoiseError
-from jaxid.estimate.minimise import problem as ls
+from jaxid.estimate.minimise import linearise, minimise, point_around
 from jaxid.estimate.refit import Lanes, refit
 from jaxid.noise import ARFilter, fit_var
 
@@ -94,9 +94,9 @@ def test_filters_that_are_known_need_one_minimum(fits, recording, monkeypatch):
 
     def counted(*arguments):
         calls.append(arguments)
-        return ls.minimise(*arguments)
+        return minimise(*arguments)
 
-    monkeypatch.setattr("jaxid.estimate.oem.minimise", counted)
+    monkeypatch.setattr("jaxid.estimate.converge.minimise", counted)
     again = jaxid.fit(jaxid.scara(), recording, jaxid.SeparablePEM(GIVEN, filters=done.noise))
     assert len(calls) == 1
     assert np.all(np.abs(again.theta - done.theta) < 0.05 * done.std)
@@ -118,9 +118,9 @@ def test_the_joint_jacobian_is_the_derivative_of_the_error(fits):
     start = jnp.asarray(optimum.start)
 
     def error(x):
-        return np.asarray(ls.linearise(problem, jnp.asarray(x), start).found.residual)
+        return np.asarray(linearise(problem, x, start).residual)
 
-    jacobian = np.asarray(ls.linearise(problem, jnp.asarray(theta), start).found.jacobian)
+    jacobian = np.asarray(linearise(problem, theta, start).jacobian)
     for k in (0, 3, 8, 9, 12):
         h = 1e-4 * max(abs(theta[k]), 1e-2)
         step = h * np.eye(len(theta))[k]
@@ -232,10 +232,10 @@ def test_a_refit_gives_the_error_of_the_values_it_gives(fits):
     signs = (-1.0) ** np.arange(len(optimum.theta))
     away = np.asarray(optimum.theta) + fits["oem"].std * signs
     lanes = dataclasses.replace(lanes, theta=jnp.asarray(away)[None])
-    before = ls.point_around(optimum.problem, jnp.asarray(away), jnp.asarray(optimum.start))
+    before = point_around(optimum.problem, jnp.asarray(away), jnp.asarray(optimum.start))
     found = refit(optimum, lanes, steps=0)
     theta = jnp.asarray(found.theta[0])
-    after = ls.point_around(optimum.problem, theta, jnp.asarray(optimum.start))
+    after = point_around(optimum.problem, theta, jnp.asarray(optimum.start))
     assert before.loss - after.loss > 4
     assert abs(found.loss[0] - after.loss) < 0.05 * (before.loss - after.loss)
 

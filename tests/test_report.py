@@ -10,7 +10,7 @@ from test_discover_cli import told
 
 import jaxid
 from jaxid.errors import ModelError
-from jaxid.report import write
+from jaxid.report import write_report
 from jaxid.report._html import Markup, join, number, probability, table, tag
 
 # What one worker has fitted serves all of them.
@@ -115,7 +115,7 @@ def _renamed(story: jaxid.Discovery) -> jaxid.Discovery:
 
 @pytest.mark.slow
 def test_names_are_shown_and_not_obeyed(tmp_path: Path) -> None:
-    path = write(_renamed(told().story), tmp_path / "hostile.html")
+    path = write_report(_renamed(told().story), tmp_path / "hostile.html")
     text = path.read_text(encoding="utf-8")
     page = Page(text)
     assert "alert(1)" in text
@@ -127,16 +127,16 @@ def test_names_are_shown_and_not_obeyed(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_story_writes_its_own_page(tmp_path: Path) -> None:
-    assert told().story.report(tmp_path / "story.html").stat().st_size > 2**20
+    assert jaxid.write_report(told().story, tmp_path / "story.html").stat().st_size > 2**20
     with pytest.raises(ModelError, match="there is no folder"):
-        told().story.report(tmp_path / "absent" / "story.html")
+        jaxid.write_report(told().story, tmp_path / "absent" / "story.html")
 
 
 @pytest.mark.slow
 def test_a_story_of_one_step_is_a_page_too(tmp_path: Path) -> None:
     story = told().story
     short = dataclasses.replace(story, verdict="adequate", steps=story.steps[:1])
-    page = Page(write(short, tmp_path / "short.html").read_text(encoding="utf-8"))
+    page = Page(write_report(short, tmp_path / "short.html").read_text(encoding="utf-8"))
     assert "nothing is missing" in " ".join(page.shown)
 
 

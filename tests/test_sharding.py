@@ -16,10 +16,17 @@ import pytest
 
 import jaxid
 from jaxid.control import Tracking
-from jaxid.estimate.minimise import problem as least_squares
-from jaxid.estimate.minimise.problem import Problem, linearise, point_around, reweighted
+from jaxid.estimate.minimise import (
+    Problem,
+    linearisation,
+    linearise,
+    linearising,
+    point_around,
+    reweighted,
+)
 from jaxid.parameters import Bounds
-from jaxid.simulation.runs import prepare, with_substeps
+from jaxid.simulation.batch import prepare
+from jaxid.simulation.steps import with_substeps
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "jaxid" / "demo" / "clean"
@@ -87,10 +94,10 @@ def test_cores_that_share_recordings_give_the_linearisation_of_one(law, monkeypa
         seen.append(start.shape[0])
         return point_around(part, theta, start)
 
-    monkeypatch.setattr(least_squares, "cores", lambda: 2)
-    monkeypatch.setattr(least_squares, "_WORTH_SHARING", 0)
-    monkeypatch.setattr(least_squares, "point_around", spy)
-    shared = linearise(problem, theta, start)
+    monkeypatch.setattr(linearising, "cores", lambda: 2)
+    monkeypatch.setattr(linearising, "_WORTH_SHARING", 0)
+    monkeypatch.setattr(linearising, "point_around", spy)
+    shared = linearisation(problem)(theta, start)
     assert seen == [2, 2]
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(shared), strict=True):
         assert a.shape == b.shape
@@ -106,8 +113,8 @@ def test_a_mesh_of_one_host_device_takes_its_shares_on_one_thread(monkeypatch):
         threads.append(threading.get_ident())
         return point_around(part, theta, start)
 
-    monkeypatch.setattr(least_squares, "_AT_A_TIME", 1)
-    monkeypatch.setattr(least_squares, "point_around", spy)
+    monkeypatch.setattr(linearising, "_AT_A_TIME", 1)
+    monkeypatch.setattr(linearising, "point_around", spy)
     linearise(dataclasses.replace(problem, mesh=mesh), theta, start)
     assert len(threads) == 3
     assert len(set(threads)) == 1

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.discovery.hypotheses import amplitudes, survey
 from jaxid.discovery.linear import linearise
-from jaxid.discovery.signatures import amplitudes, signatures, survey
+from jaxid.discovery.signatures import signatures
 from jaxid.effects import (
     AbstractEffect,
     ActuatorLag,
@@ -27,7 +28,8 @@ from jaxid.effects import (
     TorqueOffset,
     on_joint,
 )
-from jaxid.simulation.runs import prepare, set_substeps
+from jaxid.simulation.batch import prepare
+from jaxid.simulation.steps import set_substeps
 
 LINES = sim.MultiSine(
     (((0.5, 2.0, 0.3), (0.2, 5.0, 1.0)), ((0.6, 3.0, 2.0), (0.2, 6.0, 0.5))), rise=1.0

@@ -1,12 +1,19 @@
 """Programs written out scalar by scalar give the values and derivatives of the arrays."""
 
+import dataclasses
+import warnings
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import jaxid
+from jaxid.simulation import kernels
 from jaxid.simulation.unrolling import unrolled
 
 
@@ -57,7 +64,33 @@ def _derived(x, y):
     return jax.jacfwd(matrix)(three) @ three, jax.grad(lambda q: matrix(q).sum())(three)
 
 
+def _solved(x, y):
+    """Decompositions that are written out; the first pivot is zero."""
+    m = jnp.array([[0.0, 1.0, 2.0], [1.0, 0.5, 0.0], [-3.0, 1.0, 1.0]])
+    m = m.at[1, 2].set(x[0]).at[2, 2].add(y[1])
+    three = jnp.concatenate([x, y[:1]])
+    positive = m.T @ m + jnp.eye(3)
+    lower = jnp.linalg.cholesky(positive)
+    return (
+        jnp.linalg.solve(m, three),
+        jnp.linalg.inv(m),
+        jnp.linalg.det(m),
+        jax.scipy.linalg.solve(positive, three, assume_a="pos"),
+        jax.scipy.linalg.solve_triangular(lower, three, lower=True, trans=1),
+        jax.lax.linalg.triangular_solve(lower, m, lower=True, unit_diagonal=True),
+    )
+
+
+def _network(x, y):
+    """Layers too large to be written out, and small enough to be sums of columns."""
+    first = jnp.sin(jnp.arange(64.0).reshape(16, 4))
+    second = jnp.cos(jnp.arange(256.0).reshape(16, 16)) / 16
+    hidden = jnp.tanh(first @ jnp.concatenate([x, y]))
+    return jnp.tanh(second @ hidden), jnp.stack([hidden, hidden + 1]) @ first, hidden @ hidden
+
+
 CASES = [_gather, _shapes, _choices, _decomposed, _large, _empty, _chain, _derived]
+CASES += [_solved, _network]
 
 
 @pytest.mark.parametrize("fun", CASES, ids=lambda f: f.__name__.strip("_"))
@@ -72,6 +105,134 @@ def test_values_and_derivatives_are_those_of_the_arrays(fun):
     expected, found = both(x, y)
     for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-13, atol=1e-13)
+
+
+def _bits(tree) -> list[bytes]:
+    # Which NaN it is depends on the instruction.
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    return [np.where(np.isnan(leaf), np.nan, leaf).tobytes() for leaf in leaves]
+
+
+@pytest.mark.parametrize(
+    "fun",
+    [
+        lambda x: 1 / jnp.stack([x * 0.0, x * -0.0]),
+        lambda x: jnp.copysign(1.0, jnp.stack([-0.0 * x, 0.0 * x])),
+        lambda x: jnp.stack([jnp.arctan2(x * 0.0, -1.0), jnp.arctan2(x * -0.0, -1.0)]),
+        lambda x: jnp.stack([x - 0.0, x + -0.0, x + 0.0, 0.0 - x, -0.0 - x, 1.0 * x]),
+    ],
+    ids=["reciprocal", "copysign", "arctan2", "neutral"],
+)
+def test_zeros_keep_their_signs(fun):
+    for x in (0.5, 0.0, -0.0):
+        assert _bits(unrolled(fun, x)(x)) == _bits(jax.jit(fun)(x))
+
+
+_PLACES = st.integers(0, 5)
+_STEPS = st.lists(
+    st.tuples(
+        st.sampled_from(["add", "sub", "mul", "select", "neg"]),
+        _PLACES,
+        st.one_of(_PLACES, st.sampled_from([0.0, -0.0, 1.0, -1.0, 2.0, -0.5])),
+    ),
+    min_size=1,
+    max_size=6,
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    steps=_STEPS,
+    inputs=st.lists(
+        st.sampled_from([0.0, -0.0, 1.0, -2.0, 0.5, np.inf, -np.inf, np.nan]),
+        min_size=4,
+        max_size=4,
+    ),
+)
+def test_small_programs_give_the_bits_of_the_arrays(steps, inputs):
+    """All sums and products of these few powers of two are exact, in whatever order."""
+
+    def program(x):
+        values = [x[:2], x[2:]]
+        for name, one, other in steps:
+            a = values[one % len(values)]
+            b = values[other % len(values)] if isinstance(other, int) else other
+            values.append(
+                {
+                    "add": lambda a, b: a + b,
+                    "sub": lambda a, b: a - b,
+                    "mul": lambda a, b: a * b,
+                    "select": lambda a, b: jnp.where(a > b, b, a),
+                    "neg": lambda a, _: -a,
+                }[name](a, b)
+            )
+        return values, jnp.copysign(1.0, values[-1])
+
+    x = jnp.array(inputs)
+    assert _bits(unrolled(program, x)(x)) == _bits(jax.jit(program)(x))
+
+
+def test_products_are_summed_in_the_type_that_is_asked_for():
+    x = jnp.array([0.1, 0.7, -0.3], jnp.float32)
+    wide = jnp.array([1.1, -0.7, 0.3])
+    few = jnp.array([100, 90, 80], jnp.int8)
+
+    def product(a, wanted):
+        found = unrolled(lambda a: jax.lax.dot(a, a, preferred_element_type=wanted), a)(a)
+        assert found.dtype == wanted
+        return found
+
+    # To single precision the two differ in the eighth digit.
+    exact = np.asarray(x, np.float64) @ np.asarray(x, np.float64)
+    np.testing.assert_allclose(product(x, jnp.float64), exact, rtol=1e-15)
+    assert product(few, jnp.int32) == 100**2 + 90**2 + 80**2
+    np.testing.assert_allclose(product(wide, jnp.float32), wide @ wide, rtol=1e-6)
+
+
+@pytest.mark.parametrize("n", [1, 3, 8])
+def test_small_systems_are_solved_with_pivots(n):
+    rng = np.random.default_rng(n)
+    # Well conditioned, but its diagonal is zero where n is above one.
+    matrix = np.roll(np.diag(rng.uniform(1, 3, n)), 1, axis=0) + (n > 1) * 0.1 * np.tri(n, k=-1)
+    right = rng.standard_normal(n)
+    found = unrolled(jnp.linalg.solve, matrix, right)(matrix, right)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, right), rtol=1e-13, atol=1e-13)
+
+
+def _primitives(fun, *args) -> set[str]:
+    found = set()
+
+    def walk(jaxpr):
+        for eqn in jaxpr.eqns:
+            found.add(eqn.primitive.name)
+            # The transposed solve is reverse mode's alone.
+            if eqn.primitive.name == "custom_linear_solve":
+                walk(eqn.params["jaxprs"].solve.jaxpr)
+                walk(eqn.params["jaxprs"].matvec.jaxpr)
+                continue
+            for value in eqn.params.values():
+                inner = getattr(value, "jaxpr", value)
+                if hasattr(inner, "eqns"):
+                    walk(inner)
+
+    walk(jax.make_jaxpr(unrolled(fun, *args))(*args).jaxpr)
+    return found
+
+
+def test_what_splits_a_kernel_is_avoided_up_to_a_size():
+    def solved(n):
+        return _primitives(jnp.linalg.solve, jnp.eye(n), jnp.ones(n))
+
+    def layer(n):
+        return _primitives(lambda m, x: jnp.tanh(m @ x), jnp.ones((n, n)), jnp.ones(n))
+
+    lapack = {"lu", "triangular_solve"}
+    assert not lapack & solved(8)
+    assert lapack <= solved(9)
+    assert "dot_general" not in layer(32)
+    assert "dot_general" in layer(33)
+    # A product of two vectors is a sum to XLA, however long.
+    assert "dot_general" in _primitives(jnp.dot, jnp.ones(40), jnp.ones(40))
 
 
 def test_what_it_closes_over_may_be_used_in_a_loop_and_after_it():
@@ -123,6 +284,59 @@ class _ByHand(jaxid.effects.AbstractEffect):
         return self.level * motion.v / (1 + motion.v @ motion.v)
 
 
+class _Own(jaxid.effects.AbstractEffect):
+    """A torque of the user's."""
+
+    rule: Callable
+    level: jax.Array = jaxid.parameter(0.1, symbol="L", unit="N·m", scale=0.1)
+
+    def torque(self, motion):
+        return self.level * self.rule(jnp.concatenate([motion.q, motion.v]))
+
+
+def _traced(*effects: jaxid.effects.AbstractEffect) -> list[str]:
+    """What is said when a simulation with effects is traced."""
+    from jaxid.simulation.batch import prepare
+    from jaxid.simulation.integration import initial
+    from jaxid.simulation.runs import run
+
+    time = np.linspace(0, 0.2, 21)
+    q = 0.1 * np.sin(time)[:, None] * np.ones(2)
+    loop = jaxid.scara().add(*effects)
+    batch = prepare(loop, jaxid.Recordings.of(jaxid.Recording.from_arrays(time, q, q, q_ref=q)))
+    intervals = jax.tree.map(lambda leaf: leaf[0], batch.intervals)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        start = initial(loop, intervals, batch.q0[0], batch.v0[0])
+        jax.eval_shape(lambda x: run(loop, intervals, x)[1], start)
+    return [str(w.message) for w in said if issubclass(w.category, jaxid.errors.JaxidWarning)]
+
+
+def test_what_splits_the_loop_is_said_once_and_of_whom(monkeypatch):
+    monkeypatch.setattr(kernels, "_SAID", set())
+    slow = _Own(lambda x: jnp.linalg.eigvalsh(jnp.outer(x[2:], x[2:])))
+    (message,) = _traced(slow)
+    assert "_Own.torque (test_unrolling.py, line" in message
+    assert "eigh" in message
+    assert _traced(slow) == []
+    monkeypatch.setattr(kernels, "_SAID", set())
+    in_a_loop = _Own(lambda x: jax.lax.fori_loop(0, 2, lambda _, z: jnp.sort(z), x)[:2])
+    (message,) = _traced(in_a_loop)
+    assert "sort" in message
+
+
+def test_nothing_is_said_of_what_stays_fast(monkeypatch):
+    monkeypatch.setattr(kernels, "_SAID", set())
+    network = eqx.nn.MLP(4, 2, 32, 2, key=jax.random.key(0))
+    assert _traced(_Own(network), _Lapack()) == []
+    # A joint has one transmission.
+    two = [e for e in jaxid.catalogue if not issubclass(e, jaxid.effects.Backlash)]
+    fields = [{f.name for f in dataclasses.fields(e)} for e in two]
+    built_in = [e(joint=1) if "joint" in f else e() for e, f in zip(two, fields, strict=True)]
+    assert _traced(*built_in) == []
+    assert _traced(jaxid.effects.Backlash(joint=1)) == []
+
+
 def test_an_effect_that_calls_lapack_still_simulates(quick_reference):
     found, expected = (
         jaxid.simulate(jaxid.scara().add(effect()), quick_reference)[0].tau
@@ -139,7 +353,10 @@ def quick_reference():
 
 
 def test_a_program_for_any_number_of_steps_gives_the_numbers_of_a_fixed_one(quick_reference):
-    from jaxid.simulation.runs import initial, prepare, run, set_substeps
+    from jaxid.simulation.batch import prepare
+    from jaxid.simulation.integration import initial
+    from jaxid.simulation.runs import run
+    from jaxid.simulation.steps import set_substeps
 
     batch = prepare(jaxid.scara(), jaxid.Recordings.of(quick_reference))
     intervals = jax.tree.map(lambda leaf: leaf[0], batch.intervals)

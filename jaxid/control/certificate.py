@@ -10,9 +10,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Float
 
+from ..compiling import compiled
 from ..errors import ModelError, require
 from ..parameters import list_parameters, read_values, write_values
 from .computed_torque import Body, ComputedTorque
@@ -97,8 +97,8 @@ def mass_error(
     drawn = poses[rng.integers(len(poses), size=draws)]
     at = np.concatenate([np.tile(poses, (len(corners), 1)), drawn])
     values = jnp.asarray(low + shares * (high - low))
-    true = np.asarray(jax.jit(jax.vmap(mass))(values, jnp.asarray(at)))
-    taken = np.asarray(jax.jit(jax.vmap(model.mass_matrix))(jnp.asarray(at)))
+    true = np.asarray(compiled(jax.vmap(mass))(values, jnp.asarray(at)))
+    taken = np.asarray(compiled(jax.vmap(model.mass_matrix))(jnp.asarray(at)))
     if np.linalg.eigvalsh(true).min() <= 0:
         raise ModelError(
             "the mass matrix is not positive definite everywhere in this box of parameters: "
@@ -251,6 +251,8 @@ def _solve(
     A: np.ndarray, B: np.ndarray, K: np.ndarray, mu: np.ndarray
 ) -> tuple[np.ndarray, float] | None:
     """P and epsilon of the inequality (107), with Q as far from zero as it can be."""
+    import scipy
+
     cvxpy = require("cvxpy", "sdp")
     require("clarabel", "sdp")
     size, n = B.shape

@@ -3,8 +3,8 @@
 from .comparison import Comparison as Comparison
 from .comparison import compare as compare
 from .diagnosis import Diagnosis as Diagnosis
-from .diagnosis import diagnose as diagnose
 from .experiment import Experiment as Experiment
 from .experiment import next_experiment as next_experiment
+from .screening import diagnose as diagnose
 from .search import discover as discover
 from .story import Discovery as Discovery

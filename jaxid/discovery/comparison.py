@@ -4,35 +4,32 @@ import html
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
-import plotly.graph_objects as go
 from jaxtyping import Float
 
 from ..control import OpenLoop
-from ..display import figures
 from ..display.shown import AbstractShown
-from ..effects import PeriodicDisturbance
 from ..errors import FitError, RecordingError
 from ..estimate import Filtering, Fit
-from ..estimate.oem import OEM, from_best_starts, oem_of, pieces_of
+from ..estimate.converge import from_best_starts
+from ..estimate.oem import OEM, oem_of
+from ..estimate.pieces import pieces_of
 from ..estimate.regression import filtered
 from ..estimate.result import errors_to_dict, joint_columns, relative_errors
 from ..noise import autocorrelation
 from ..recording import Recording, Recordings
+from ..simulation.batch import band_of, compared, prepare
+from ..simulation.integration import reason
 from ..simulation.loop import ClosedLoop
-from ..simulation.runs import (
-    Simulated,
-    band_of,
-    by_recording,
-    compared,
-    prepare,
-    simulate_batch,
-    with_substeps,
-)
+from ..simulation.runs import BY_SAMPLE, Simulated, by_recording, simulate_batch
+from ..simulation.steps import with_substeps
 from ..storage.saved import save
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import plotly.graph_objects as go
 
 
 class Comparison(AbstractShown):
@@ -45,7 +42,7 @@ class Comparison(AbstractShown):
     loop: ClosedLoop
     recordings: Recordings
     runs: tuple[Simulated, ...]
-    errors: pd.DataFrame
+    errors: "pd.DataFrame"
 
     @property
     def signal(self) -> str:
@@ -53,8 +50,10 @@ class Comparison(AbstractShown):
         return "position" if isinstance(self.loop.controller, OpenLoop) else "torque"
 
     @property
-    def error_percent(self) -> pd.DataFrame:
+    def error_percent(self) -> "pd.DataFrame":
         """Relative error by recording and joint, % (Table 3 of Brunot et al. 2016)."""
+        import pandas as pd
+
         table = self.errors.xs(self.signal, level="signal")
         assert isinstance(table, pd.DataFrame)
         return table
@@ -103,23 +102,15 @@ class Comparison(AbstractShown):
             )
         return self.recordings.names.index(recording)
 
-    def where(self) -> pd.DataFrame:
-        """On which coordinates the residuals depend: p-values corrected for their number, shares.
-
-        Free-form curves of every coordinate and tones are held against the whitened residuals,
-        what the model's own parameters can absorb taken off.
-        """
-        from .diagnosis import diagnose
-
-        return diagnose(self, catalogue=(PeriodicDisturbance,), progress=False).where_table()
-
-    def plot(self, recording: int | str = 0) -> go.Figure:
+    def plot(self, recording: int | str = 0) -> "go.Figure":
         """Measured, simulated and residual of one recording, with the residual's autocorrelation.
 
         **Arguments:**
 
         - `recording`: number from 0, or name.
         """
+        from ..display import figures
+
         k = self._index(recording)
         time, measured, simulated = self.judged(k)
         acf, bound = self.autocorrelation(k)
@@ -140,8 +131,10 @@ class Comparison(AbstractShown):
             f"{record.name}: {self.signal}, measured and simulated",
         )
 
-    def plot_errors(self) -> go.Figure:
+    def plot_errors(self) -> "go.Figure":
         """Relative errors of all recordings as bars."""
+        from ..display import figures
+
         table = self.error_percent
         return figures.error_bars(list(table.columns), list(table.index), table.to_numpy())
 
@@ -205,11 +198,13 @@ def compare(
     for run, recording in zip(runs, recordings, strict=True):
         if not np.isfinite(run.tau).all() or not np.isfinite(run.q).all():
             raise FitError(
-                f"the loop {loop.name} diverges when it is simulated along {recording.name}: "
-                "fit it first, start from other values, or take smaller steps "
-                "(jaxid.Stepping(substeps=...))"
+                f"the loop {loop.name} diverges when it is simulated along {recording.name} "
+                f"({reason(run.result)}): fit it first, start from other values, or take smaller "
+                "steps (jaxid.Stepping(substeps=...))"
             )
-    return Comparison(loop, recordings, runs, _errors(loop, recordings, runs))
+    return Comparison(
+        loop=loop, recordings=recordings, runs=runs, errors=_errors(loop, recordings, runs)
+    )
 
 
 def _simulate_in_windows(
@@ -230,9 +225,10 @@ def _simulate_in_windows(
             name: np.concatenate(
                 [getattr(part, name)[first:] for part, first in zip(parts, cut, strict=True)]
             )
-            for name in Simulated.__dataclass_fields__
+            for name in BY_SAMPLE
         }
-        runs.append(_padded(Simulated(**whole), recording))
+        worst = max(int(part.result) for part in parts)
+        runs.append(_padded(Simulated(**whole, result=np.asarray(worst, np.int32)), recording))
     return tuple(runs)
 
 
@@ -241,8 +237,8 @@ def _padded(run: Simulated, recording: Recording) -> Simulated:
     missing = recording.samples - len(run.time)
     if missing == 0:
         return run
-    values = {}
-    for name in Simulated.__dataclass_fields__:
+    values: dict[str, Any] = {"result": run.result}
+    for name in BY_SAMPLE:
         had = getattr(run, name)
         measured = getattr(recording, name, None)
         tail = np.repeat(had[-1:], missing, axis=0) if measured is None else measured[-missing:]
@@ -250,8 +246,12 @@ def _padded(run: Simulated, recording: Recording) -> Simulated:
     return Simulated(**values)
 
 
-def _errors(loop: ClosedLoop, recordings: Recordings, runs: tuple[Simulated, ...]) -> pd.DataFrame:
+def _errors(
+    loop: ClosedLoop, recordings: Recordings, runs: tuple[Simulated, ...]
+) -> "pd.DataFrame":
     """Relative errors of position, velocity and torque by recording."""
+    import pandas as pd
+
     tables = {}
     pairs = list(zip(recordings, runs, strict=True))
     position = [r.q for r in recordings]

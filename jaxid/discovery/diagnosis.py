@@ -1,39 +1,34 @@
-"""Every effect of the catalogue held against the residual of one fit, without a refit."""
+"""What a diagnosis knows: where a fitted model fails, and which effects may be missing."""
 
 import dataclasses
 import html
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
-import plotly.graph_objects as go
 from jaxtyping import Float
 
-from ..display import figures
-from ..display.progress import working
 from ..display.shown import AbstractShown
-from ..effects import AbstractEffect, AbstractTransmission, Curve, Motion, Scene
-from ..effects import catalogue as known
-from ..errors import FitError, ModelError
+from ..effects import AbstractEffect, Curve, Motion, Scene
+from ..errors import FitError
 from ..estimate import Fit
-from ..estimate.oem import _free_starts, _signals, from_best_starts, oem_of, pieces_of
+from ..estimate.oem import oem_of
+from ..estimate.pieces import pieces_of
 from ..noise import ARFilter
 from ..parameters import write_values
-from ..recording import Recordings
-from ..simulation.loop import ClosedLoop
-from ..simulation.runs import Batch, prepare, with_substeps
 from ..storage.saved import save
 from .comparison import Comparison
-from .linear import Linearised, base_columns, linearise
-from .score import Data, Gram, chance, corrected, effective_tests
-from .separate import columns_of, estimate_noise, leftover
-from .signatures import Hypothesis, amplitudes, candidates, curves, signatures, survey
+from .hypotheses import Hypothesis, amplitudes, on_recordings
+from .score import Data, Gram
+from .separate import leftover
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import plotly.graph_objects as go
 
 
 class Verdict(eqx.Module):
@@ -120,7 +115,7 @@ class Diagnosis(AbstractShown):
     def predicted_error(self, verdict: Verdict) -> Float[np.ndarray, " joints"]:
         """Relative error on the fitted recordings that adding the effect would leave, %."""
         rest = leftover(self.data, self.noise, verdict.hypothesis.columns)
-        share = _share_left(self.fit, self.data, rest)
+        share = share_left(self.fit, self.data, rest)
         return over_recordings(self.fit.error_percent.to_numpy() * share)
 
     def correlation(self, one: Verdict, other: Verdict) -> float:
@@ -140,8 +135,10 @@ class Diagnosis(AbstractShown):
             and self.correlation(verdict, other) > 0.9
         )
 
-    def table(self) -> pd.DataFrame:
+    def table(self) -> "pd.DataFrame":
         """The ranking: what each explains, corrected p-value, amplitude, predicted error."""
+        import pandas as pd
+
         rows = []
         total = self.gram.rest
         for verdict in self.ranking:
@@ -175,8 +172,10 @@ class Diagnosis(AbstractShown):
             )
         return pd.DataFrame(rows)
 
-    def where_table(self) -> pd.DataFrame:
+    def where_table(self) -> "pd.DataFrame":
         """Where the model fails: on which coordinate which joint's torque depends, best first."""
+        import pandas as pd
+
         total = self.gram.rest
         return pd.DataFrame(
             [
@@ -191,8 +190,10 @@ class Diagnosis(AbstractShown):
             ]
         )
 
-    def plot(self) -> go.Figure:
+    def plot(self) -> "go.Figure":
         """The leading entries of the ranking by what they explain."""
+        from ..display import figures
+
         top = self.ranking[:12]
         labels = [_label(v) for v in top]
         shares = np.array([100 * v.explained / self.gram.rest for v in top])
@@ -200,7 +201,7 @@ class Diagnosis(AbstractShown):
             labels, shares, np.array([v.p_value < self.significance for v in top])
         )
 
-    def plot_shares(self, recording: int = 0, joint: int = 1, contenders: int = 4) -> go.Figure:
+    def plot_shares(self, recording: int = 0, joint: int = 1, contenders: int = 4) -> "go.Figure":
         """What each contender explains of one joint's residual in time, the model refitted to it.
 
         **Arguments:**
@@ -208,6 +209,8 @@ class Diagnosis(AbstractShown):
         - `recording`: number from 0; of the piece, where the fit was in windows.
         - `joint`: counted from 1. `contenders`: how many.
         """
+        from ..display import figures
+
         keep = self.data.mask[recording]
         shares = {}
         for verdict in self.ranking[:contenders]:
@@ -219,7 +222,7 @@ class Diagnosis(AbstractShown):
         unit = self.fit.loop.arm.units()[0][joint - 1]
         return figures.shares_in_time(time, residual, shares, unit=unit)
 
-    def plot_where(self, place: int = 0) -> go.Figure:
+    def plot_where(self, place: int = 0) -> "go.Figure":
         """The residual of all recordings against a coordinate on which it depends, and its mean.
 
         Where it depends on the direction of motion as well, it is drawn times the sign of velocity.
@@ -228,6 +231,8 @@ class Diagnosis(AbstractShown):
 
         - `place`: in `where`, 0 for the strongest.
         """
+        from ..display import figures
+
         curve = self.where[place].hypothesis.effect
         assert isinstance(curve, Curve)
         joint, motion = curve.joint, self.motion
@@ -278,12 +283,6 @@ class Diagnosis(AbstractShown):
             "noise_floor_percent": self.floor_percent().tolist(),
         }
 
-    def next_experiment(self, **settings: Any) -> Any:
-        """The reference that would tell look-alikes apart: see `jaxid.next_experiment`."""
-        from .experiment import next_experiment
-
-        return next_experiment(self, **settings)
-
     def depends_on(self) -> list[dict[str, Any]]:
         """Coordinates on which a significant part of the residual depends, best first."""
         return [
@@ -328,287 +327,7 @@ def coordinate_unit(curve: Curve, torque: Sequence[str], position: Sequence[str]
     return position[curve.of - 1] + {"v": "/s", "a": "/s²"}.get(curve.coordinate, "")
 
 
-def diagnose(
-    fit: Fit | Comparison,
-    *,
-    catalogue: Sequence[Any] = known,
-    significance: float = 0.01,
-    progress: bool = True,
-) -> Diagnosis:
-    """Screens every effect of a catalogue, on all joints, at all settings, from one fit.
-
-    Exact sensitivities make it cheap: the closed loop is linearised along its runs, and every
-    hypothesis is the response of that linear system to its torque.
-
-    **Arguments:**
-
-    - `fit`: of a loop that can be simulated; or a comparison of a loop with recordings.
-    - `catalogue`: effect classes, effects, or functions from a `Scene` to effects; for instance
-      `(*jaxid.catalogue, Mine)`.
-    - `significance`: corrected p-value below which something counts as missing.
-
-    **Raises:** `FitError` where the fitted loop cannot be simulated; `RecordingError` where
-    recordings were sampled at different rates.
-    """
-    fit.recordings.common_period()
-    if fit.error_percent.to_numpy().max() < 1e-8:
-        raise FitError(
-            f"{fit.loop.name} leaves nothing of these recordings but rounding: they were simulated "
-            "with it, and there is nothing to diagnose"
-        )
-    with working(f"diagnosis of {fit.loop.name}", progress) as say:
-        loop = with_substeps(fit.loop, fit.recordings)
-        output, batch, free = _as_fitted(fit, loop)
-        say("linearising along the recordings")
-        linear = linearise(loop, batch, output)
-        residual, base = _residual_and_base(batch, linear, loop, output, free)
-        if not np.isfinite(residual).all() or not np.isfinite(base).all():
-            raise FitError(
-                f"{loop.name} cannot be simulated at its fitted values, so nothing can be held "
-                "against its residual: fit it by OEM first"
-            )
-        tones, trials = _tones(residual, np.asarray(batch.kept), fit.recordings)
-        scene = survey(loop, fit.recordings, linear.motion, tones)
-        proposed = candidates(catalogue, scene, trials)
-        parted = {e.joint for e in loop.effects if isinstance(e, AbstractTransmission)}
-        proposed = [
-            (effect, tests)
-            for effect, tests in proposed
-            if not (isinstance(effect, AbstractTransmission) and effect.joint in parted)
-        ]
-        proposed += [(curve, 1.0) for curve in curves(scene, linear.motion)]
-        row = {"tau": 0, "q": 1}[output]
-        hypotheses, table = signatures(loop, batch, linear, proposed, row, say)
-        _check_finite(loop, hypotheses, table)
-        table = _at_samples(batch, table)
-        data = Data(residual, base, table, np.asarray(batch.kept))
-        say(f"scoring {len(hypotheses)} hypotheses")
-        try:
-            motion = _sampled(batch, linear.motion)
-            return _judge(fit, data, hypotheses, scene, motion, significance)
-        except np.linalg.LinAlgError as error:
-            raise FitError(
-                f"what is left of these recordings by {loop.name} is too large to be held against "
-                "anything: check the units of the recordings and the loop's gains"
-            ) from error
-
-
-def _check_finite(
-    loop: ClosedLoop,
-    hypotheses: Sequence[Hypothesis],
-    table: Float[np.ndarray, "recordings points outputs columns"],
-) -> None:
-    """Raises `FitError` where a signature is not finite."""
-    there = np.asarray(np.isfinite(table).all(axis=(0, 1, 2)))
-    bad = [h for h in hypotheses if not there[list(h.columns)].all()]
-    if len(bad) > len(hypotheses) / 2:
-        raise FitError(
-            f"{loop.name} runs away once it is linearised along these recordings: take smaller "
-            "steps, jaxid.Stepping(substeps=...)"
-        )
-    if bad:
-        first = bad[0]
-        raise FitError(
-            f"the signature of {first.name} on joint {first.joint or 'all'} is not finite along "
-            "these recordings: mend its torque, or leave it out of the catalogue"
-        )
-
-
-def _as_fitted(fit: Fit | Comparison, loop: ClosedLoop) -> tuple[str, Batch, np.ndarray]:
-    """Which output is compared, the batch, and which initial states are free, as in the fit."""
-    method = oem_of(fit)
-    pieces = pieces_of(fit.recordings, method.window)
-    batch = prepare(loop, pieces)
-    free = _free_starts(method, pieces, batch)
-    if free.any():
-        start, n = getattr(getattr(fit, "optimum", None), "start", None), loop.joints
-        if start is not None and len(start) == len(pieces):
-            batch = dataclasses.replace(batch, q0=start[:, :n], v0=start[:, n:])
-        else:
-            batch = from_best_starts(method, loop, pieces, batch)
-    return _signals(method, loop)[0], batch, free
-
-
-def _sampled(batch: Batch, tree: Any) -> Any:
-    """Leaves of `(recordings, points, ...)` at the samples alone, of a grid that may be finer."""
-    if batch.at is None:
-        return tree
-    rows = np.arange(len(batch.at))[:, None], np.asarray(batch.at)
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[rows], tree)
-
-
-def _at_samples(batch: Batch, x: Float[np.ndarray, "recordings points *axes"]) -> np.ndarray:
-    """Rows at the samples, in the band that is compared, zero where there is no sample."""
-    x = _sampled(batch, x)
-    mask = np.asarray(batch.mask).reshape(*batch.mask.shape, *(1,) * (x.ndim - 2))
-    x = x * mask.astype(x.dtype)
-    return x if batch.band is None else np.asarray(batch.band(jnp.asarray(x)), x.dtype)
-
-
-def _residual_and_base(
-    batch: Batch, linear: Linearised, loop: ClosedLoop, output: str, free: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    seen = _sampled(batch, np.asarray(linear.seen[:, :, {"tau": 0, "q": 1}[output]]))
-    residual = (np.asarray(getattr(batch, output)) - seen) * np.asarray(batch.mask)[..., None]
-    if batch.band is not None:
-        residual = np.asarray(batch.band(jnp.asarray(residual)))
-    p = loop.theta.shape[0]
-    base = _at_samples(batch, np.asarray(base_columns(linear, p, bool(free.any()))))
-    if not free.any():
-        return residual, base
-    shared, own = base[..., :p], base[..., p:]
-    blocks = [shared]
-    for k in np.flatnonzero(free):
-        alone = np.zeros_like(own)
-        alone[k] = own[k]
-        blocks.append(alone)
-    return residual, np.concatenate(blocks, axis=-1)
-
-
-def _tones(
-    residual: np.ndarray, mask: np.ndarray, recordings: Recordings, most: int = 4
-) -> tuple[list[list[float]], float]:
-    """Frequencies that stand out of each joint's spectrum, and how many they were picked from."""
-    period = recordings.common_period()
-    n = residual.shape[1]
-    f = np.fft.rfftfreq(4 * n, period)
-    usable = (f > 2 / (n * period)) & (f < 0.4 / period)
-    found = []
-    for j in range(residual.shape[2]):
-        power = np.zeros(len(f))
-        for row, there in zip(residual[..., j], mask, strict=True):
-            window = np.zeros(n)
-            window[there] = np.hanning(int(there.sum()))
-            power += np.abs(np.fft.rfft(row * window, 4 * n)) ** 2
-        # Against the level around it, so that coloured noise does not take every place.
-        width = max(9, n // 20)
-        around = np.exp(np.convolve(np.log(power + 1e-300), np.ones(width) / width, mode="same"))
-        stands = np.where(usable, power / around, 0.0)
-        row = []
-        for _ in range(most):
-            k = int(stands.argmax())
-            row.append(float(f[k]))
-            stands[np.abs(f - f[k]) < 2 / (n * period)] = 0.0
-        found.append(row)
-    return found, float(usable.sum() / 4 * residual.shape[2])
-
-
-# Rows from which noise is told from physics as well as from all: a minute of two joints at 400 Hz.
-_ENOUGH = 50_000
-
-
-def _judge(
-    fit: Fit | Comparison,
-    data: Data,
-    hypotheses: list[Hypothesis],
-    scene: Scene,
-    motion: Motion,
-    significance: float,
-) -> Diagnosis:
-    blocks = [h.columns for h in hypotheses]
-    windows = len(data.residual) != len(fit.recordings)
-    apart = estimate_noise(data.middle(_ENOUGH), blocks, alike=windows)
-    data, noise = dataclasses.replace(data, level=apart.data.level), apart.noise
-    gram = Gram.of(data, noise)
-    tests = effective_tests(gram, blocks)
-    ranking: dict[tuple[Any, ...], Verdict] = {}
-    forms: dict[tuple[Any, ...], Verdict] = {}
-    where: dict[tuple[Any, ...], Verdict] = {}
-    for hypothesis, explained, freedom in zip(hypotheses, *gram.explained(blocks), strict=True):
-        verdict = _verdict(gram, hypothesis, float(explained), int(freedom), tests)
-        effect = hypothesis.effect
-        if isinstance(effect, Curve):
-            where[(effect.label, effect.joint, effect.signed)] = verdict
-            continue
-        _keep_better(ranking, verdict.key, verdict)
-        _keep_better(forms, (*verdict.key, type(effect)), verdict)
-    columns = columns_of(blocks, apart.chosen)
-    best = tuple(sorted(ranking.values(), key=_order, reverse=True))
-    curves = tuple(sorted(where.values(), key=_order, reverse=True))
-    return Diagnosis(
-        fit,
-        best,
-        tuple(sorted(forms.values(), key=_order, reverse=True)),
-        curves,
-        _pair(gram, hypotheses, best, curves, tests),
-        noise,
-        data,
-        gram,
-        scene,
-        motion,
-        _floor(fit, data, leftover(data, noise, columns), len(columns)),
-        tests,
-        significance,
-    )
-
-
-def _pair(
-    gram: Gram,
-    hypotheses: list[Hypothesis],
-    ranking: tuple[Verdict, ...],
-    where: tuple[Verdict, ...],
-    tests: float,
-) -> tuple[Verdict, ...]:
-    """Two effects that only together explain what the best curve does, each leading entry tried."""
-    if not where or not ranking or where[0].evidence < ranking[0].evidence:
-        return ()
-    effects = [h for h in hypotheses if not isinstance(h.effect, Curve)]
-    best, most = (), where[0].evidence
-    for first in ranking[:8]:
-        rest = gram.without(first.hypothesis.columns)
-        explained, freedom = rest.explained([h.columns for h in effects])
-        own = [h.name == first.key[0] and h.joint == first.key[1] for h in effects]
-        evidence = np.where(own, -np.inf, explained - freedom * np.log(gram.count))
-        k = int(np.argmax(evidence))
-        if first.evidence + evidence[k] > most:
-            most = first.evidence + evidence[k]
-            value, count = gram.explained([effects[k].columns])
-            second = _verdict(gram, effects[k], float(value[0]), int(count[0]), tests)
-            best = (first, second)
-    return best
-
-
-def _keep_better(found: dict[tuple[Any, ...], Verdict], key: tuple[Any, ...], new: Verdict) -> None:
-    """Keeps the better of two settings; one that is not physical gives way to one that is."""
-    old = found.get(key)
-    if old is None or (new.possible, new.evidence) > (old.possible, old.evidence):
-        found[key] = new
-
-
-def _order(verdict: Verdict) -> float:
-    return verdict.evidence
-
-
-def _verdict(
-    gram: Gram, hypothesis: Hypothesis, explained: float, freedom: int, tests: float
-) -> Verdict:
-    p = corrected(min(1.0, chance(explained, freedom) * hypothesis.tests), tests)
-    price = freedom * np.log(gram.count) + 2 * np.log(hypothesis.tests)
-    possible = freedom > 0 and _within_bounds(gram, hypothesis)
-    return Verdict(hypothesis, explained - float(price), explained, freedom, p, possible)
-
-
-def _within_bounds(gram: Gram, hypothesis: Hypothesis) -> bool:
-    """Whether the predicted amplitudes are physical (a drag that pushes is not)."""
-    values, _ = gram.amplitude(hypothesis.columns)
-    return all(
-        low < value < high
-        for value, low, high in zip(values, hypothesis.lower, hypothesis.upper, strict=True)
-    )
-
-
-def _floor(
-    fit: Fit | Comparison, data: Data, rest: np.ndarray, lost: int
-) -> Float[np.ndarray, "recordings joints"]:
-    """Relative error by recording and joint of noise alone, what the model took of it put back."""
-    outputs = data.residual.shape[2]
-    freedom = 1 - (data.base.shape[-1] + lost) / (data.mask.sum() * outputs)
-    # What is least once whitened may be more than what the model leaves as it is.
-    share = np.minimum(_share_left(fit, data, rest), 1) / np.sqrt(max(freedom, 0.1))
-    return fit.error_percent.to_numpy() * share
-
-
-def _share_left(
+def share_left(
     fit: Fit | Comparison, data: Data, rest: np.ndarray
 ) -> Float[np.ndarray, "recordings joints"]:
     """What is left of a fit's error; of all its recordings together where data are windows."""
@@ -622,28 +341,3 @@ def over_recordings(
 ) -> Float[np.ndarray, " joints"]:
     """Relative errors of several recordings in one for each joint: their quadratic mean, %."""
     return np.sqrt(np.mean(percent**2, axis=0))
-
-
-def on_recordings(effect: AbstractEffect) -> str:
-    """The recordings that an effect is on, as a sentence goes on; nothing where it is on all."""
-    named = getattr(effect, "recordings", ())
-    return f" in {' and '.join(named)}" if named else ""
-
-
-def effect_parameters(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[int, str, str]]:
-    """Where an effect's free values stand in `loop.theta`: place, name in the effect, unit.
-
-    **Raises:** `ModelError` where the loop does not have the effect.
-    """
-    position = next((k for k, e in enumerate(loop.effects) if e is effect), None)
-    if position is None:
-        raise ModelError(f"{effect.effect_name()} is not one of the loop's effects: add it first")
-    found, place = [], 0
-    for p in loop.free_parameters:
-        steps = p.where.steps  # type: ignore[attr-defined]
-        if steps[:2] == ("effects", position):
-            for k in range(p.size):
-                name = steps[-1] if not p.several else f"{steps[-1]}[{k + 1}]"
-                found.append((place + k, str(name), loop.unit(p)))
-        place += p.size
-    return found

@@ -2,27 +2,29 @@
 
 import html
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
-import pandas as pd
-import plotly.graph_objects as go
 from jaxtyping import Float
 
 from ..control import OpenLoop
-from ..display import figures
 from ..display.shown import AbstractShown
 from ..effects import AbstractTransmission
 from ..errors import FitError
 from ..excitation import Limits
 from ..recording import Recording
+from ..simulation.batch import prepare
 from ..simulation.loop import ClosedLoop
-from ..simulation.runs import prepare, with_substeps
-from .diagnosis import Diagnosis, Verdict, _at_samples, _sampled
-from .linear import base_columns, linearise
+from ..simulation.steps import with_substeps
+from .diagnosis import Diagnosis, Verdict
+from .hypotheses import effect_on
+from .linear import at_samples, base_columns, linearise, sampled
 from .score import Data, Gram
 from .signatures import signatures
-from .story import effect_on
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
 
 
 class Experiment(AbstractShown):
@@ -40,8 +42,10 @@ class Experiment(AbstractShown):
     then: float
     units: tuple[tuple[str, ...], tuple[str, ...]] = eqx.field(static=True)
 
-    def plot(self) -> go.Figure:
+    def plot(self) -> "go.Figure":
         """The reference in time."""
+        from ..display import figures
+
         r = self.recording
         assert r.q_ref is not None
         panels = [
@@ -51,6 +55,8 @@ class Experiment(AbstractShown):
         return figures.signals(r.time, panels)
 
     def _repr_html_(self) -> str:
+        import pandas as pd
+
         r = self.recording
         assert r.q_ref is not None
         speed = np.abs(np.gradient(r.q_ref, r.time, axis=0))
@@ -128,7 +134,13 @@ def next_experiment(
     names = tuple(effect_on(*v.key) for v in chosen)
     columns = [list(v.hypothesis.columns) for v in chosen]
     now = _apart(diagnosis.gram, columns, [diagnosis.gram.amplitude(c)[0] for c in columns])
-    return Experiment(runs[best], names, now, float(scores[best]), loop.arm.units())
+    return Experiment(
+        recording=runs[best],
+        effects=names,
+        now=now,
+        then=float(scores[best]),
+        units=loop.arm.units(),
+    )
 
 
 def _group(diagnosis: Diagnosis) -> list[Verdict]:
@@ -178,9 +190,9 @@ def _separations(
     linear = linearise(loop, batch, "tau")
     proposed = [(v.hypothesis.effect, 1.0) for v in chosen]
     hypotheses, table = signatures(loop, batch, linear, proposed, 0, lambda text: None)
-    base = _at_samples(batch, np.asarray(base_columns(linear, loop.theta.shape[0], False)))
-    rows = _at_samples(batch, table)
-    seen = _sampled(batch, np.asarray(linear.seen))
+    base = at_samples(batch, np.asarray(base_columns(linear, loop.theta.shape[0], False)))
+    rows = at_samples(batch, table)
+    seen = sampled(batch, np.asarray(linear.seen))
     kept = np.asarray(batch.kept)
     columns = [list(h.columns) for h in hypotheses]
     sizes = [diagnosis.gram.amplitude(v.hypothesis.columns)[0] for v in chosen]
@@ -190,7 +202,12 @@ def _separations(
         runs.append(Recording(recording.time, q, tau, q_ref=recording.q_ref, name=recording.name))
         if not np.isfinite(seen[k]).all() or np.any(np.abs(tau) > 1.05 * limits.torque):
             continue
-        data = Data(np.zeros_like(tau)[None], base[k : k + 1], rows[k : k + 1], kept[k : k + 1])
+        data = Data(
+            residual=np.zeros_like(tau)[None],
+            base=base[k : k + 1],
+            table=rows[k : k + 1],
+            mask=kept[k : k + 1],
+        )
         scores[k] = _apart(Gram.of(data, diagnosis.noise), columns, sizes)
     return scores, runs
 

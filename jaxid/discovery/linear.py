@@ -1,25 +1,21 @@
 """The loop along a run as a linear time-varying system: linearise once, force many."""
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from ..compiling import compiled
 from ..effects import AbstractTransmission, Motion
+from ..simulation.batch import Batch, Interval
+from ..simulation.integration import SIGNALS, initial
 from ..simulation.loop import ClosedLoop
-from ..simulation.runs import (
-    SIGNALS,
-    Batch,
-    Interval,
-    advance,
-    each,
-    initial,
-    run,
-    with_rolled_stages,
-)
+from ..simulation.runs import advance, each, run
+from ..simulation.steps import with_forward_mode, with_rolled_stages
 
 Place = Literal["push", "noise", "rate", "pull"]
 
@@ -44,7 +40,7 @@ class Linearised(eqx.Module):
     places: tuple[Place, ...] = eqx.field(static=True)
 
 
-@eqx.filter_jit
+@compiled
 def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     """Runs the loop and linearises every interval.
 
@@ -52,7 +48,7 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
 
     - `output`: which of `SIGNALS` is compared.
     """
-    loop = with_rolled_stages(loop)
+    loop = with_forward_mode(with_rolled_stages(loop))
     n, theta, row = loop.joints, loop.theta, SIGNALS.index(output)
     p = theta.shape[0]
     parted = any(isinstance(e, AbstractTransmission) or e.loaded for e in loop.effects)
@@ -62,7 +58,8 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     def one(u, interval, x):
         outside = dict(zip(places, u[p:].reshape(-1, 2, n), strict=True))
         forced = dataclasses.replace(interval, **outside)
-        after, seen = advance(loop.with_theta(u[:p]), forced, x)
+        # A failed solve is not finite, and its number not needed.
+        after, seen, _ = advance(loop.with_theta(u[:p]), forced, x)
         return jnp.concatenate([after, seen[row]])
 
     def at(interval, x):
@@ -73,7 +70,7 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
 
     def whole(intervals: Interval, q0, v0):
         x0 = initial(loop, intervals, q0, v0)
-        states, seen = run(loop, intervals, x0)
+        states, seen, _ = run(loop, intervals, x0)
         a, b, c, d = jax.vmap(at)(intervals, states)
         start = jax.jacfwd(lambda z: initial(loop, intervals, z[:n], z[n:]))(
             jnp.concatenate([q0, v0])
@@ -93,7 +90,7 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     return Linearised(*each(whole, batch.intervals, batch.q0, batch.v0), places=places)
 
 
-@eqx.filter_jit
+@compiled
 def base_columns(
     linear: Linearised, parameters: int, free_start: bool
 ) -> Float[Array, "recordings points outputs columns"]:
@@ -119,7 +116,7 @@ def base_columns(
     return each(one, linear.A, linear.B, linear.C, linear.D, linear.start)
 
 
-@eqx.filter_jit
+@compiled
 def respond(
     linear: Linearised,
     place: Place,
@@ -158,3 +155,19 @@ def respond(
         return jax.lax.scan(body, (s, values[0]), (*matrices, after))[1]
 
     return each(one, linear.A, linear.B, linear.C, linear.D, linear.start, values)
+
+
+def sampled(batch: Batch, tree: Any) -> Any:
+    """Leaves of `(recordings, points, ...)` at the samples alone, of a grid that may be finer."""
+    if batch.at is None:
+        return tree
+    rows = np.arange(len(batch.at))[:, None], np.asarray(batch.at)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[rows], tree)
+
+
+def at_samples(batch: Batch, x: Float[np.ndarray, "recordings points *axes"]) -> np.ndarray:
+    """Rows at the samples, in the band that is compared, zero where there is no sample."""
+    x = sampled(batch, x)
+    mask = np.asarray(batch.mask).reshape(*batch.mask.shape, *(1,) * (x.ndim - 2))
+    x = x * mask.astype(x.dtype)
+    return x if batch.band is None else np.asarray(batch.band(jnp.asarray(x)), x.dtype)

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-import scipy
 from jaxtyping import Bool, Float, Int
 
 from ..errors import FitError
@@ -122,6 +121,8 @@ def _through(
 
     SciPy's `lfilter` takes a convolution a column, five times as slow with a thousand of them.
     """
+    import scipy
+
     reach = len(taps) - 1
     row = np.concatenate([taps[::-1], np.zeros(size - 1, taps.dtype)])
     band = scipy.linalg.toeplitz(np.concatenate([taps[-1:], np.zeros(size - 1, taps.dtype)]), row)
@@ -190,6 +191,8 @@ class Gram(eqx.Module):
     @classmethod
     def of(cls, data: Data, noise: Sequence[ARFilter]) -> "Gram":
         """Whitens, projects the base out, and forms the products that tests need."""
+        import scipy
+
         white = Whitened.of(data, noise)
         x = white.signatures
         # BLAS counts by columns: what it calls upper is our lower half.
@@ -284,6 +287,8 @@ def _strong(
 
 def chance(value: float, freedom: int) -> float:
     """Probability that noise alone explains that much (upper tail of chi squared)."""
+    import scipy
+
     return float(scipy.stats.chi2.sf(value, freedom)) if freedom else 1.0
 
 
@@ -292,6 +297,8 @@ def effective_tests(gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0
 
     The smallest p-value of correlated tests is distributed as that of fewer independent ones.
     """
+    import scipy
+
     n = len(gram.gram)
     noise = _root(gram.gram) @ np.random.default_rng(seed).standard_normal((n, draws))
     smallest = np.ones(draws)

@@ -10,145 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..effects import AbstractEffect, Coulomb, Curve, Motion, Scene, check_declared
-from ..effects import catalogue as known
-from ..effects.curve import curve_over
-from ..errors import ModelError
+from ..compiling import compiled
+from ..effects import AbstractEffect, Motion
 from ..linear_algebra import exponential
-from ..parameters import Parameter, list_parameters, read_values, write_values
-from ..recording import Recordings
-from ..simulation.loop import ClosedLoop, effect_loads
-from ..simulation.runs import Batch, each, initial, run, with_rolled_stages
+from ..parameters import read_values, write_values
+from ..simulation.batch import Batch
+from ..simulation.dynamics import effect_loads
+from ..simulation.integration import initial
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import each, run
 from ..simulation.sharing import at_once, taken
+from ..simulation.steps import with_rolled_stages
+from .hypotheses import Hypothesis, amplitudes
 from .linear import Linearised, respond
-
-
-class Hypothesis(eqx.Module):
-    """One effect at one setting, with its columns in the table of signatures.
-
-    `lower` and `upper` bound the amplitudes; `tests` counts how many settings it stands for, where
-    it was picked from many by the data.
-    """
-
-    effect: AbstractEffect
-    columns: tuple[int, ...] = eqx.field(static=True)
-    lower: tuple[float, ...] = eqx.field(static=True)
-    upper: tuple[float, ...] = eqx.field(static=True)
-    tests: float = eqx.field(static=True, default=1.0)
-
-    @property
-    def name(self) -> str:
-        """The effect's name."""
-        return self.effect.effect_name()
-
-    @property
-    def joint(self) -> int | None:
-        """Its joint, counted from 1; None for effects of the whole arm."""
-        return getattr(self.effect, "joint", None)
-
-
-def amplitudes(effect: AbstractEffect) -> tuple[Parameter, ...]:
-    """The parameters in which the effect is linear; none where it is screened by simulations."""
-    if effect.finite:
-        return ()
-    return tuple(p for p in list_parameters(effect) if p.declaration.free and p.declaration.linear)
-
-
-# --- which hypotheses --------------------------------------------------------------------------
-
-
-def survey(
-    loop: ClosedLoop,
-    recordings: Recordings,
-    motion: Motion,
-    tones: Sequence[Sequence[float]],
-) -> Scene:
-    """What screening knows of the recordings and the nominal motion."""
-    q = np.asarray(motion.q).reshape(-1, loop.joints)
-    low, high = q.min(axis=0), q.max(axis=0)
-    speed = np.abs(np.asarray(motion.v)).reshape(-1, loop.joints).max(axis=0)
-    mass = np.asarray(jax.vmap(loop.arm.mass_matrix)(jnp.asarray(q[:: max(1, len(q) // 64)])))
-    sharp = {e.joint: float(e.gamma) for e in loop.effects if isinstance(e, Coulomb)}
-    return Scene(
-        low,
-        # A joint that is held still has a travel all the same, which shapes can be a part of.
-        np.maximum(high, low + 1e-6),
-        np.maximum(speed, 1e-6),
-        np.abs(np.asarray(motion.tau)).reshape(-1, loop.joints).max(axis=0),
-        1 / np.mean(np.diagonal(np.linalg.inv(mass), axis1=1, axis2=2), axis=0),
-        np.array([sharp.get(j, 100.0) for j in range(1, loop.joints + 1)]),
-        float(np.median([r.period for r in recordings])),
-        float(max(r.duration for r in recordings)),
-        tuple(recordings.names),
-        tuple(tuple(float(f) for f in row) for row in tones),
-        tuple(float(x) for x in loop.arm.link_lengths()),
-        float(loop.arm.gravity()),
-        tuple(loop.arm.prismatic()),
-        tuple(loop.arm.first_moments()),
-    )
-
-
-def curves(scene: Scene, motion: Motion, knots: int = 12) -> list[Curve]:
-    """A curve over every coordinate, plain and with the sign of velocity, on every joint."""
-    over: list[tuple[Any, int, np.ndarray]] = [("t", 1, np.asarray(motion.t).ravel())]
-    for name in ("q", "v", "a", "tau"):
-        values = np.asarray(getattr(motion, name)).reshape(-1, len(scene.q_low))
-        over += [(name, j, values[:, j - 1]) for j in scene.joints]
-    made = []
-    for coordinate, of, values in over:
-        low, high = curve_over(values)
-        for joint in scene.joints:
-            for signed in (False, True):
-                made.append(
-                    Curve(
-                        joint=joint,
-                        coordinate=coordinate,
-                        of=of,
-                        low=low,
-                        high=high,
-                        signed=signed,
-                        coefficients=jnp.zeros(knots),
-                        gamma=scene.sharpness(joint),
-                    )
-                )
-    return made
-
-
-def candidates(
-    catalogue: Sequence[Any], scene: Scene, trials: float
-) -> list[tuple[AbstractEffect, float]]:
-    """Every instance that a catalogue proposes, with how many settings it stands for.
-
-    **Arguments:**
-
-    - `catalogue`: effect classes, effects, or functions from a `Scene` to effects.
-    - `trials`: how many frequencies the tones of the scene were picked from.
-
-    **Raises:** `ModelError` for an entry that is none of these.
-    """
-    made: list[AbstractEffect] = []
-    for entry in catalogue:
-        if isinstance(entry, AbstractEffect):
-            made.append(entry)
-        elif isinstance(entry, type) and issubclass(entry, AbstractEffect):
-            made.extend(entry.screened(scene))
-        elif callable(entry):
-            given: Any = entry(scene)
-            made.extend([given] if isinstance(given, AbstractEffect) else list(given))
-        else:
-            raise ModelError(
-                f"{entry!r} cannot be screened: a catalogue holds effect classes, effects, or "
-                "functions from a scene to effects"
-            )
-    for one in {type(e): e for e in made if type(e) not in known}.values():
-        check_declared(one, len(scene.slides))
-    picked = max(1, sum(len(row) for row in scene.tones))
-    return [
-        (e, trials / picked if e.effect_name() == "periodic_disturbance" else 1.0) for e in made
-    ]
-
-
-# --- their signatures --------------------------------------------------------------------------
 
 
 def _settled_states(effect: AbstractEffect, motion: Motion) -> Float[Array, "points states"]:
@@ -202,8 +76,6 @@ Forces = tuple[
     Float[Array, "*points joints columns"],
     Float[Array, "*points joints columns"],
 ]
-
-
 AllForces = tuple[
     Float[Array, "*points joints columns"],
     Float[Array, "*points joints reading"],
@@ -233,7 +105,7 @@ def _forces(effect: AbstractEffect, motion: Motion, left: Float[Array, "points j
     return jax.tree.map(lambda x: x[..., None], along(jnp.zeros(0)))
 
 
-@eqx.filter_jit
+@compiled
 def _left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings points joints"]:
     """Torque that the loop's own effects on the drives leave for the links along the runs."""
 
@@ -247,7 +119,7 @@ def _left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recording
     return jax.vmap(along)(motion)
 
 
-@eqx.filter_jit
+@compiled
 def _all_forces(
     groups: list[AbstractEffect],
     motion: Motion,
@@ -307,7 +179,7 @@ def _grouped(effects: Sequence[AbstractEffect]) -> list[tuple[AbstractEffect, li
     ]
 
 
-@eqx.filter_jit
+@compiled
 def _finite(
     loop: ClosedLoop, stacked: AbstractEffect, batch: Batch, row: int
 ) -> Float[Array, "recordings points joints settings"]:

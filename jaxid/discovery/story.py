@@ -5,15 +5,12 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import numpy as np
-import pandas as pd
-import plotly.graph_objects as go
 from jaxtyping import Float
 
-from ..display import figures
 from ..display.shown import AbstractShown
 from ..effects import AbstractEffect, Curve
 from ..errors import ModelError
@@ -21,7 +18,12 @@ from ..estimate import Fit
 from ..simulation.loop import ClosedLoop
 from ..storage.saved import save
 from .comparison import Comparison
-from .diagnosis import Diagnosis, effect_parameters, on_recordings, over_recordings
+from .diagnosis import Diagnosis, over_recordings
+from .hypotheses import effect_on, on_recordings
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import plotly.graph_objects as go
 
 Outcome = Literal["adequate", "explained", "outside_catalogue"]
 
@@ -114,8 +116,10 @@ class Discovery(AbstractShown):
             "model lacks."
         )
 
-    def table(self) -> pd.DataFrame:
+    def table(self) -> "pd.DataFrame":
         """Error by step and joint, on fitted and held-out recordings, %."""
+        import pandas as pd
+
         rows = []
         for step in self.steps:
             row: dict[str, Any] = {"step": step.label}
@@ -127,8 +131,10 @@ class Discovery(AbstractShown):
             rows.append(row)
         return pd.DataFrame(rows).set_index("step")
 
-    def plot(self) -> go.Figure:
+    def plot(self) -> "go.Figure":
         """The error falling, step by step, with the noise floor."""
+        from ..display import figures
+
         series = {"fitted": np.stack([_rms(s.fit.error_percent) for s in self.steps])}
         if all(s.held_out is not None for s in self.steps):
             series["held out"] = np.stack(
@@ -162,20 +168,6 @@ class Discovery(AbstractShown):
         **Raises:** `SaveError` where it cannot be written.
         """
         return save(self, path)
-
-    def report(self, path: str | Path) -> Path:
-        """Writes the story as one self-contained HTML page.
-
-        **Arguments:**
-
-        - `path`: the file to write; its folder must exist.
-
-        **Raises:** `ModelError` where the folder does not exist.
-        """
-        # The page stands on a higher floor: nothing here depends on it but this call.
-        from ..report import write
-
-        return write(self, path)
 
     def to_dict(self) -> dict[str, Any]:
         """The story as plain JSON, as `jaxid discover --json` writes it."""
@@ -237,11 +229,6 @@ class Discovery(AbstractShown):
         )
 
 
-def effect_on(name: str, joint: int | None) -> str:
-    """An effect's name and its joint, if it has one, as a sentence has them."""
-    return name + ("" if joint is None else f" on joint {joint}")
-
-
 def _spoken(steps: Sequence[Step]) -> list[str]:
     """Added effects in words; what was added twice is said once."""
     effects = [step.added for step in steps if step.added is not None]
@@ -260,7 +247,7 @@ def _placed(name: str, effect: AbstractEffect) -> str:
     return effect_on(name, getattr(effect, "joint", None)) + on_recordings(effect)
 
 
-def _rms(table: pd.DataFrame) -> Float[np.ndarray, " joints"]:
+def _rms(table: "pd.DataFrame") -> Float[np.ndarray, " joints"]:
     return over_recordings(table.to_numpy())
 
 
@@ -285,3 +272,22 @@ def _found_parameters(steps: Sequence[Step], added: int) -> dict[str, dict[str, 
         }
         for place, name, unit in effect_parameters(fit.loop, effect)
     }
+
+
+def effect_parameters(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[int, str, str]]:
+    """Where an effect's free values stand in `loop.theta`: place, name in the effect, unit.
+
+    **Raises:** `ModelError` where the loop does not have the effect.
+    """
+    position = next((k for k, e in enumerate(loop.effects) if e is effect), None)
+    if position is None:
+        raise ModelError(f"{effect.effect_name()} is not one of the loop's effects: add it first")
+    found, place = [], 0
+    for p in loop.free_parameters:
+        steps = p.where.steps  # type: ignore[attr-defined]
+        if steps[:2] == ("effects", position):
+            for k in range(p.size):
+                name = steps[-1] if not p.several else f"{steps[-1]}[{k + 1}]"
+                found.append((place + k, str(name), loop.unit(p)))
+        place += p.size
+    return found

@@ -1,16 +1,19 @@
 """How a result shows itself in a notebook: its table, then its figure."""
 
 import abc
+from typing import TYPE_CHECKING
 
 import equinox as eqx
-import plotly.graph_objects as go
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
 
 
 class AbstractShown(eqx.Module):
     """A result with a table in HTML and a figure."""
 
     @abc.abstractmethod
-    def plot(self) -> go.Figure:
+    def plot(self) -> "go.Figure":
         """The figure."""
 
     @abc.abstractmethod

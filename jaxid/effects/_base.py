@@ -3,7 +3,8 @@
 import dataclasses
 import re
 from collections.abc import Iterable
-from typing import ClassVar
+from functools import lru_cache
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -156,17 +157,33 @@ def check_declared(effect: AbstractEffect, joints: int) -> None:
     """
     if effect.inertial or effect.needs_acceleration:
         return
-    zeros = jnp.zeros(joints)
-    state = effect.initial_state()
-    motion = Motion(jnp.zeros(()), zeros, zeros, zeros, zeros, state, jnp.asarray(0))
-    traced = jax.make_jaxpr(lambda a: effect.torque(dataclasses.replace(motion, a=a)))(zeros).jaxpr
-    _, used = dce_jaxpr(traced, [True] * len(traced.outvars))
-    if any(used):
+    arrays, rest = eqx.partition(effect, eqx.is_array)
+    shapes = jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), arrays)
+    leaves, structure = jax.tree.flatten(shapes, is_leaf=lambda leaf: isinstance(leaf, tuple))
+    if _uses_acceleration(structure, tuple(leaves), rest, joints):
         raise ModelError(
             f"{effect.effect_name()} uses motion.a, which is zero for it: write `inertial = True` "
             "into its class if its torque is proportional to acceleration, or "
             "`needs_acceleration = True`"
         )
+
+
+@lru_cache(maxsize=1024)
+def _uses_acceleration(
+    structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...], rest: Any, joints: int
+) -> bool:
+    """Whether a torque depends on motion.a: traced once for all effects of a kind."""
+
+    def torque(leaves: list[Array], a: Float[Array, " joints"]) -> Float[Array, " joints"]:
+        effect = eqx.combine(jax.tree.unflatten(structure, leaves), rest)
+        zeros, now = jnp.zeros(joints), jnp.zeros(())
+        state = effect.initial_state()
+        return effect.torque(Motion(now, zeros, zeros, a, zeros, state, jnp.asarray(0)))
+
+    leaves = [jax.ShapeDtypeStruct(shape, kind) for shape, kind in shapes]
+    traced = jax.make_jaxpr(torque)(leaves, jax.ShapeDtypeStruct((joints,), float)).jaxpr
+    _, used = dce_jaxpr(traced, [True] * len(traced.outvars))
+    return any(used[len(leaves) :])
 
 
 def on_joint(joint: int, value: Float[Array, ""], motion: Motion) -> Float[Array, " joints"]:

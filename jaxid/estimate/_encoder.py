@@ -6,13 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Array, Float
 
+from ..compiling import compiled
 from ..effects import Motion
 from ..errors import FitError
 from ..recording import Recording
-from ..simulation.loop import ClosedLoop, inverse
+from ..simulation.dynamics import inverse
+from ..simulation.loop import ClosedLoop
 from .regression import effect_states
 from .result import determined_covariance
 from .states import AbstractStates, FourierStates
@@ -47,6 +48,8 @@ def errors_of(
       the regression's own filter.
     - `rows`: which samples the rows are. `factor`: samples from one row to the next.
     """
+    import scipy
+
     if isinstance(states, FourierStates):
         basis = states.basis(recording)[0]
         # Columns of unit length and orthogonal: errors of their amplitudes are white again.
@@ -68,7 +71,7 @@ def errors_of(
     return Stationary(by_lag[: int(np.max(np.nonzero(heard))) + 1])
 
 
-@eqx.filter_jit
+@compiled
 def _sensitivities(loop: ClosedLoop, at: Motion) -> Float[Array, "rows joints 3 joints"]:
     states = effect_states(loop, at.t, at)
 
@@ -142,6 +145,8 @@ def _low_rank_whitening(wide: np.ndarray, rest: np.ndarray) -> Callable[[np.ndar
 def _banded_whitening(
     sensitivity: np.ndarray, by_lag: np.ndarray, rest: np.ndarray
 ) -> Callable[[np.ndarray], np.ndarray]:
+    import scipy
+
     rows, joints = sensitivity.shape[:2]
     lags = min(len(by_lag), rows)
     width = joints * lags

@@ -2,19 +2,21 @@
 
 import dataclasses
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, AbstractTransmission, check_declared
 from ..errors import FitError
-from ..recording import Recording, Recordings
-from ..recording._checks import missing_after
+from ..recording import Recording, Recordings, missing_after
+from ..simulation.batch import check_joints, check_law
 from ..simulation.loop import ClosedLoop
-from ..simulation.runs import check_joints, check_law
 from .oem import OEM
 from .result import AbstractMethod, Fit, Status
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def fit(
@@ -148,7 +150,7 @@ def _of_motion(found: Fit) -> Float[np.ndarray, "recordings joints"]:
     return np.where(moved > 1e-2 * moved.max(), size / np.where(moved > 0, moved, 1.0), 1.0)
 
 
-def _left_percent(found: Fit, percent: pd.DataFrame) -> Float[np.ndarray, " joints"]:
+def _left_percent(found: Fit, percent: "pd.DataFrame") -> Float[np.ndarray, " joints"]:
     """Relative error of each joint over all recordings; of a signal that is nil there is none."""
     errors = percent.to_numpy()
     left = np.array([np.linalg.norm(r, axis=0) for r in found.residuals])

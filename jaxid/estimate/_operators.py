@@ -4,7 +4,6 @@ import itertools
 
 import equinox as eqx
 import numpy as np
-import scipy
 from jaxtyping import Float
 
 from ..errors import FitError
@@ -59,6 +58,8 @@ class Operator(eqx.Module):
           is not would be off by different shares, of the size of (λ step)².
         - `held`: True where each sample holds until the next instead.
         """
+        import scipy
+
         flat = x.reshape(len(x), -1)
         pieces = np.zeros((4, len(flat) - 1, flat.shape[1]))
         pieces[0] = flat[:-1]
@@ -78,6 +79,8 @@ class Operator(eqx.Module):
         self, pieces: Float[np.ndarray, "4 pieces columns"], start: Float[np.ndarray, " columns"]
     ) -> list[Float[np.ndarray, "samples columns"]]:
         """Outputs of the first-order low-passes in a row, at the samples."""
+        import scipy
+
         n = len(self.poles)
         # The input's value and derivatives obey u' = u1, u1' = u2, ... within a piece.
         rate = np.zeros((n + 4, n + 4))

@@ -11,13 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..compiling import compiled
 from ..effects import AbstractTransmission, Motion
 from ..errors import FitError
 from ..parameters import Bounds, list_parameters, read_values, write_values
 from ..recording import Recording, Recordings
 from ..signals.smoothing import evened
-from ..simulation.loop import ClosedLoop, effect_loads
-from ..simulation.runs import Simulated, recording_label
+from ..simulation.batch import recording_label
+from ..simulation.dynamics import effect_loads
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import Simulated
 from ._encoder import Kernels, errors_of, row_errors, solve_weighted
 from ._operators import Operator
 from .covariance import score_covariance
@@ -86,7 +89,7 @@ def split_torque(loop: ClosedLoop, at: Motion, once: bool) -> Float[Array, "4 sa
     return jnp.moveaxis(jax.vmap(one)(at, states), 1, 0)
 
 
-@eqx.filter_jit
+@compiled
 def _columns(loop: ClosedLoop, at: Motion, once: bool) -> tuple[Array, Array]:
     parameters = linear_parameters(loop)
     theta = read_values(loop, parameters)

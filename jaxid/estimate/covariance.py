@@ -2,19 +2,22 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 from jaxtyping import Float
 
+from ..compiling import compiled
 from ..errors import FitError
 from ..noise import Noise, fit_ar, innovations
 from ..parameters import Bounds
-from .minimise.problem import Problem, Sensitivity, absorb_start, linearise, unfiltered
+from .minimise import Problem, Sensitivity, absorb_start, linearise, unfiltered
 from .result import Fit, determined_covariance
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Deviations = Literal["sandwich", "white", "paper"]
 
@@ -53,7 +56,7 @@ class Reduced(eqx.Module):
         """At an optimum, with its linearisation if there is one already."""
         problem = optimum.problem
         if found is None:
-            found = linearise(problem, jnp.asarray(optimum.theta), jnp.asarray(optimum.start)).found
+            found = linearise(problem, optimum.theta, optimum.start)
         p = problem.loop.theta.shape[0]
         found = absorb_start(found, problem.free)
         jacobian, residual = np.asarray(found.jacobian), np.asarray(found.residual)
@@ -125,7 +128,7 @@ def covariance_of(
     return determined_covariance(np.asarray(information), names, scales, meat)
 
 
-_plain = eqx.filter_jit(unfiltered)
+_plain = compiled(unfiltered)
 
 
 def _papers_information(
@@ -193,7 +196,7 @@ def optimum_of(fit: Fit, what: str) -> Optimum:
     return fit.optimum
 
 
-def deviations(fit: Fit) -> pd.DataFrame:
+def deviations(fit: Fit) -> "pd.DataFrame":
     """Standard deviations of a fit by every formula, beside each other.
 
     **Arguments:**
@@ -205,6 +208,8 @@ def deviations(fit: Fit) -> pd.DataFrame:
 
     **Raises:** `FitError` for a fit by regression.
     """
+    import pandas as pd
+
     optimum = optimum_of(fit, "deviations of that kind")
     columns = {}
     for kind in SAID:

@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..compiling import compiled
 from ..errors import FitError
 from ..parameters import Bounds, write_values
 from ..recording import Recordings
+from ..simulation.batch import compared
 from ..simulation.loop import ClosedLoop
-from ..simulation.runs import Simulated, compared, simulate
+from ..simulation.runs import Simulated, simulate
 from .idim import Solved, Stacked, Weights, regression_fit, solve, stack
 from .regression import Filtering, linear_parameters
 from .result import AbstractMethod, Fit, Status
@@ -29,7 +31,7 @@ def physical(loop: ClosedLoop, theta: Float[np.ndarray, " parameters"]) -> Close
     return moved if float(inertia) > 0 else loop
 
 
-@eqx.filter_jit
+@compiled
 def _moved(
     loop: ClosedLoop, theta: Float[Array, " parameters"]
 ) -> tuple[ClosedLoop, Float[Array, ""]]:

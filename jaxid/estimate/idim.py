@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..compiling import compiled
 from ..errors import FitError
 from ..parameters import Bounds, Parameter, write_values
 from ..recording import Recordings
@@ -45,9 +46,10 @@ def stack(loop: ClosedLoop, recordings: Recordings, filtering: Filtering, motion
     """
     columns, rights = [], []
     for k, recording in enumerate(recordings):
-        motion = filtered(recording, filtering) if motions is None else motions[k]
+        own = filtering.on(recording)
+        motion = filtered(recording, own) if motions is None else motions[k]
         wide, right = regression(loop, recording, motion)
-        reduce = decimator(recording, filtering)
+        reduce = decimator(recording, own)
         columns.append(reduce(wide))
         rights.append(reduce(right))
     scales = np.asarray(Bounds.of(linear_parameters(loop)).scale)
@@ -143,19 +145,18 @@ def regression_fit(
     measured = stacked.split(stacked.right)
     residuals = stacked.split(solved.residual)
     return Fit(
-        fitted,
-        recordings,
-        method,
-        status,
-        solved.covariance,
-        tuple(residuals),
-        relative_errors(recordings, measured, residuals),
-        iterations,
-        0,
-        time.perf_counter() - started,
-        "least squares, equation (5)",
-        solved.undetermined,
-        tuple(notes),
+        loop=fitted,
+        recordings=recordings,
+        method=method,
+        status=status,
+        covariance=solved.covariance,
+        residuals=tuple(residuals),
+        error_percent=relative_errors(recordings, measured, residuals),
+        iterations=iterations,
+        seconds=time.perf_counter() - started,
+        deviations="least squares, equation (5)",
+        undetermined=solved.undetermined,
+        notes=tuple(notes),
     )
 
 
@@ -170,7 +171,7 @@ def _beyond_bounds(chosen: Sequence[Parameter], theta: Float[np.ndarray, " p"]) 
     return [f"{', '.join(outside)} outside the declared bounds, which a regression does not know"]
 
 
-_smallest_inertia = eqx.filter_jit(lambda arm: arm.smallest_inertia())
+_smallest_inertia = compiled(lambda arm: arm.smallest_inertia())
 
 
 class IDIM(AbstractMethod):
@@ -191,7 +192,11 @@ class IDIM(AbstractMethod):
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
         """Estimates the parameters in which torque is linear; called by `jaxid.fit`."""
         started = time.perf_counter()
+        stacked, solved = self.solved(loop, recordings)
+        return regression_fit(loop, recordings, self, stacked, solved, started)
+
+    def solved(self, loop: ClosedLoop, recordings: Recordings) -> tuple[Stacked, Solved]:
+        """The regression and its solution."""
         stacked = stack(loop, recordings, self.filtering)
         names = tuple(name for p in linear_parameters(loop) for name in p.names)
-        solved = solve(stacked, names, self.weights)
-        return regression_fit(loop, recordings, self, stacked, solved, started)
+        return stacked, solve(stacked, names, self.weights)

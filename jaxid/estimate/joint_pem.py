@@ -14,23 +14,18 @@ from ..errors import NoiseError
 from ..noise import ARFilter, Criterion, Noise, VectorAR, check_series
 from ..parameters import Bounds
 from ..recording import Recordings
+from ..simulation.batch import prepare
 from ..simulation.loop import ClosedLoop
-from ..simulation.runs import prepare, with_substeps
+from ..simulation.steps import with_substeps
+from .converge import Converged, converge
 from .covariance import Deviations
-from .minimise.problem import Coefficients, Minimum, Problem, minimise
-from .oem import (
-    OEM,
-    _converge,
-    _Done,
-    _first_weights,
-    _free_starts,
-    _report,
-    _signals,
-    pieces_of,
-    start_values,
-)
+from .minimise import Coefficients, Minimum, Problem, Stopping, minimise
+from .oem import OEM
 from .pem import Order, keeping, noise_filters
+from .pieces import compared_signals, estimated_starts, first_weights, pieces_of
+from .reporting import report
 from .result import AbstractMethod, Fit, Status
+from .start import start_values
 
 
 class JointPEM(AbstractMethod):
@@ -77,9 +72,8 @@ class JointPEM(AbstractMethod):
             done = _converge_jointly(self, loop, recordings, orders, noise, say, deadline)
         total = done.iterations + (0 if first is None else first.iterations)
         done = dataclasses.replace(done, iterations=total)
-        method = dataclasses.replace(self.oem, deviations=self.deviations)
         seconds = time.perf_counter() - started
-        return _report(method, done, recordings, seconds, self, estimated_noise(done))
+        return report(self.deviations, done, recordings, seconds, self, estimated_noise(done))
 
     def _orders(
         self,
@@ -87,11 +81,11 @@ class JointPEM(AbstractMethod):
         recordings: Recordings,
         say: Callable[[str], None],
         deadline: float,
-    ) -> tuple[Sequence[int], Noise, _Done | None]:
+    ) -> tuple[Sequence[int], Noise, Converged | None]:
         """Orders, and filters and fit to start from where orders were not given."""
         if self.orders is not None:
             return self.orders, None, None
-        first = _converge(self.oem, loop, recordings, say, deadline=deadline)
+        first = converge(self.oem, loop, recordings, say, deadline=deadline)
         with keeping(first, self.oem, recordings):
             order = Order(self.criterion, self.highest, self.white)
             noise = noise_filters(first, order, None, self.coupled)
@@ -108,16 +102,16 @@ def _converge_jointly(
     noise: Noise,
     say: Callable[[str], None],
     deadline: float,
-) -> _Done:
+) -> Converged:
     """Minimises, then again with the noise covariance that follows, until that settles.
 
     At that point the gradient of the squared error is the gradient of the determinant.
     """
     oem = method.oem
-    pieces, signals = pieces_of(recordings, oem.window), _signals(oem, loop)
+    pieces, signals = pieces_of(recordings, oem.window), compared_signals(oem, loop)
     batch = prepare(loop, pieces)
-    free = jnp.asarray(_free_starts(oem, pieces, batch))
-    weights = jnp.asarray(_first_weights(loop, pieces, signals))
+    free = jnp.asarray(estimated_starts(oem, pieces, batch))
+    weights = jnp.asarray(first_weights(loop, pieces, signals))
     outputs = weights.shape[0]
     if len(orders) != outputs:
         raise NoiseError(f"{len(orders)} orders are given for {outputs} outputs: give one for each")
@@ -139,10 +133,11 @@ def _converge_jointly(
     total, worth = 0, 1e-2
     while True:
         left = oem.max_steps - total
-        minimum = minimise(problem, theta, start, oem.tolerance, worth, left, say, deadline)
+        settings = Stopping(oem.tolerance, worth, left, deadline, oem.solver)
+        minimum = minimise(problem, theta, start, settings, say)
         total += minimum.iterations
         theta, start = minimum.point.theta, minimum.point.start
-        ended = minimum.status in (Status.diverged, Status.max_seconds)
+        ended = not minimum.status.simulated or minimum.status is Status.max_seconds
         if ended or total >= oem.max_steps:
             break
         mix = _new_mix(problem, minimum)
@@ -153,7 +148,16 @@ def _converge_jointly(
         problem = dataclasses.replace(problem, mix=jnp.asarray(mix))
     own = loop.theta.shape[0]
     fitted = loop.with_theta(theta[:own])
-    return _Done(fitted, pieces, batch, weights, minimum, problem, signals, total)
+    return Converged(
+        loop=fitted,
+        pieces=pieces,
+        batch=batch,
+        weights=weights,
+        minimum=minimum,
+        problem=problem,
+        signals=signals,
+        iterations=total,
+    )
 
 
 def _check_samples(problem: Problem, orders: Sequence[int]) -> None:
@@ -199,7 +203,7 @@ def _new_mix(problem: Problem, minimum: Minimum) -> Float[np.ndarray, "outputs o
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
-def estimated_noise(done: _Done) -> tuple[ARFilter, ...] | VectorAR:
+def estimated_noise(done: Converged) -> tuple[ARFilter, ...] | VectorAR:
     """The noise filters at the minimum, in the outputs' own units."""
     problem, w = done.problem, np.asarray(done.weights)
     assert problem.coefficients is not None

@@ -1,7 +1,6 @@
 """Separable prediction error: the output error through the inverse of an estimated noise filter."""
 
 import contextlib
-import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple
@@ -24,10 +23,14 @@ from ..noise import (
 )
 from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
-from ..simulation.runs import with_substeps
+from ..simulation.steps import with_substeps
+from .converge import Converged, converge
 from .covariance import Deviations
-from .oem import OEM, _converge, _Done, _report, _signals, start_values
+from .oem import OEM
+from .pieces import compared_signals
+from .reporting import report
 from .result import AbstractMethod, Fit, Status
+from .start import start_values
 
 
 class Order(NamedTuple):
@@ -91,11 +94,10 @@ class SeparablePEM(AbstractMethod):
             deadline = started + self.oem.max_seconds
             done, noise, rounds = self._alternate(loop, recordings, say, deadline)
         kind = self.deviations or self._deviations(done, noise)
-        method = dataclasses.replace(self.oem, deviations=kind)
         seconds = time.perf_counter() - started
-        return _report(method, done, recordings, seconds, self, noise, rounds)
+        return report(kind, done, recordings, seconds, self, noise, rounds)
 
-    def _deviations(self, done: _Done, noise: Noise) -> Deviations:
+    def _deviations(self, done: Converged, noise: Noise) -> Deviations:
         """(A.1) knows one level of noise: the other where recordings differ by more than chance."""
         ratios = np.stack(levels([innovations(x, noise) for x in residual_series(done)]))
         uneven = np.any(ratios.max(axis=0) > 1.3 * ratios.min(axis=0))
@@ -107,27 +109,27 @@ class SeparablePEM(AbstractMethod):
         recordings: Recordings,
         say: Callable[[str], None],
         deadline: float,
-    ) -> tuple[_Done, Noise, int]:
+    ) -> tuple[Converged, Noise, int]:
         """Where it ended, with which filters, after how many alternations."""
         if self.filters is not None:
-            outputs = len(_signals(self.oem, loop)) * loop.joints
+            outputs = len(compared_signals(self.oem, loop)) * loop.joints
             given = self.filters
             count = given.outputs if isinstance(given, VectorAR) else len(given)
             if count != outputs:
                 raise NoiseError(f"filters for {count} outputs are given, there are {outputs}")
-            done = _converge(self.oem, loop, recordings, say, self.filters, deadline)
+            done = converge(self.oem, loop, recordings, say, self.filters, deadline)
             return done, self.filters, 0
-        done = _converge(self.oem, loop, recordings, say, deadline=deadline)
+        done = converge(self.oem, loop, recordings, say, deadline=deadline)
         noise: Noise = None
         before = np.inf
         for k in range(1, self.rounds + 1):
-            if done.minimum.status in (Status.diverged, Status.max_seconds):
+            if not done.minimum.status.simulated or done.minimum.status is Status.max_seconds:
                 return done, noise, k - 1
             with keeping(done, self.oem, recordings):
                 order = Order(self.criterion, self.highest, self.white)
                 noise = noise_filters(done, order, self.orders, self.coupled)
             if self.first_step == "filtered":
-                done = _converge(self.oem, done.loop, recordings, say, noise, deadline)
+                done = converge(self.oem, done.loop, recordings, say, noise, deadline)
             spread = prediction_spread(done, noise)
             if abs(before - spread) < self.tolerance:
                 return done, noise, k
@@ -136,16 +138,16 @@ class SeparablePEM(AbstractMethod):
 
 
 @contextlib.contextmanager
-def keeping(done: _Done, method: OEM, recordings: Recordings) -> Iterator[None]:
+def keeping(done: Converged, method: OEM, recordings: Recordings) -> Iterator[None]:
     """Hands the fit so far on with a `NoiseError`."""
     try:
         yield
     except NoiseError as error:
-        error.fit = _report(method, done, recordings, 0.0)
+        error.fit = report(method.deviations, done, recordings, 0.0, method)
         raise
 
 
-def residual_series(done: _Done) -> list[np.ndarray]:
+def residual_series(done: Converged) -> list[np.ndarray]:
     """Measured less simulated, `(samples, outputs)` for each recording, in their own units."""
     raw = np.asarray(done.minimum.point.found.raw) / np.asarray(done.weights)
     mask = np.asarray(done.batch.kept)
@@ -153,7 +155,7 @@ def residual_series(done: _Done) -> list[np.ndarray]:
 
 
 def noise_filters(
-    done: _Done, order: Order, orders: Sequence[int] | None = None, coupled: bool = False
+    done: Converged, order: Order, orders: Sequence[int] | None = None, coupled: bool = False
 ) -> tuple[ARFilter, ...] | VectorAR:
     """The AR filter of each output's residuals, or of all together, over all recordings.
 
@@ -183,14 +185,14 @@ def noise_filters(
     return tuple(filters)
 
 
-def output_name(done: _Done, output: int) -> str:
+def output_name(done: Converged, output: int) -> str:
     """How messages call an output."""
     signal, joint = divmod(output, done.loop.joints)
     what = {"tau": "torque", "q": "position"}[done.signals[signal]]
     return f"joint {joint + 1}'s {what}"
 
 
-def prediction_spread(done: _Done, noise: Noise) -> float:
+def prediction_spread(done: Converged, noise: Noise) -> float:
     """Logarithm of the determinant of the prediction error's covariance."""
     white = [innovations(x, noise) for x in residual_series(done)]
     together = np.concatenate(white)

@@ -2,22 +2,23 @@
 
 import dataclasses
 import html
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
-import plotly.graph_objects as go
-import scipy
 from jaxtyping import Float
 
-from ..display import figures
 from ..display.progress import working
 from ..display.shown import AbstractShown
 from ..errors import FitError
 from .covariance import Reduced, covariance_of, optimum_of
 from .refit import Lanes, refit
 from .result import Fit
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import plotly.graph_objects as go
 
 # In deviations: dense enough for a cubic, wide enough for intervals of 99.7 %.
 REACH = np.array([-4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0])
@@ -40,6 +41,8 @@ class Profile(AbstractShown):
 
         An end that lies beyond the profile, as where a bound cuts it off, is its last value.
         """
+        import scipy
+
         centre = self.fit.theta[self.fit.names.index(self.name)]
         root = np.sign(self.values - centre) * np.sqrt(self.deviance)
         along = scipy.interpolate.PchipInterpolator(self.values, root)
@@ -61,8 +64,10 @@ class Profile(AbstractShown):
         """Unit of the parameter."""
         return self.fit.units[self.fit.names.index(self.name)]
 
-    def plot(self) -> go.Figure:
+    def plot(self) -> "go.Figure":
         """Deviance along the profile, and the parabola that the fit's deviation promises."""
+        from ..display import figures
+
         k = self.fit.names.index(self.name)
         centre, std = float(self.fit.theta[k]), float(self.fit.std[k])
         return figures.deviance(self.values, self.deviance, centre, std, self.name, self.unit)
@@ -72,6 +77,8 @@ class Profile(AbstractShown):
         return f"{self.name}: 95 % from {low:.4g} to {high:.4g} {self.unit} by likelihood profile"
 
     def _repr_html_(self) -> str:
+        import pandas as pd
+
         shares = (0.68, 0.95, 0.997)
         rows = [self.interval(share) for share in shares]
         table = pd.DataFrame(rows, index=[f"{100 * x:g} %" for x in shares])
@@ -166,7 +173,9 @@ def _loss_and_variance(optimum) -> tuple[float, float]:
     return loss, loss / (rows - float(np.sum(reduced.spent)))
 
 
-def profile_table(profiles: dict[str, Profile], level: float = 0.95) -> pd.DataFrame:
+def profile_table(profiles: dict[str, Profile], level: float = 0.95) -> "pd.DataFrame":
     """Intervals of several profiles, one row each."""
+    import pandas as pd
+
     rows = {name: found.interval(level) for name, found in profiles.items()}
     return pd.DataFrame(rows, index=["low", "high"]).T.rename_axis("parameter")

@@ -9,19 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..compiling import compiled
 from ..display.progress import silent
 from ..errors import FitError
 from ..linear_algebra import solve
 from ..noise import ARFilter, VectorAR, fit_ar
 from .covariance import Optimum, optimum_of
-from .minimise.problem import (
+from .minimise import (
+    BoundedDescent,
+    LevenbergMarquardt,
     Point,
     Problem,
     Sensitivity,
     absorb_start,
     linearise,
     point_around,
-    products,
+    promised,
     raw_residual,
     unfiltered,
 )
@@ -95,76 +98,50 @@ def _measuring(problem: Problem, measured: Float[Array, "recordings samples outp
     return dataclasses.replace(problem, batch=dataclasses.replace(problem.batch, **parts))
 
 
-def _bounded_step(
-    point: Point,
-    low: Float[Array, " values"],
-    high: Float[Array, " values"],
-    damping: Float[Array, ""],
-) -> tuple[Float[Array, " values"], Float[Array, "recordings initials"], Float[Array, ""]]:
-    """A damped Gauss-Newton step inside bounds, and what it promises."""
-    width = jnp.sqrt(jnp.diag(point.gram))
-    width = jnp.where(width > 0, width, 1.0)
-    initials = point.cross.shape[1]
-    reduced, push = point.gram, point.slope
-    inner = jnp.zeros((point.start.shape[0], initials, len(width) + 1))
-    if initials:
-        size = jnp.einsum("raa->ra", point.start_gram)
-        own = jnp.where(size > 0, (1e-10 + damping) * size, 1.0)[..., None] * jnp.eye(initials)
-        pair = jnp.concatenate([point.cross, point.start_slope[..., None]], axis=2)
-        inner = jax.vmap(solve)(point.start_gram + own, pair)
-        reduced = reduced - jnp.einsum("rap,raq->pq", point.cross, inner[..., :-1])
-        push = push - jnp.einsum("rap,ra->p", point.cross, inner[..., -1])
-    scaled = reduced / jnp.outer(width, width) + (1e-12 + damping) * jnp.eye(len(width))
-    low, high, push = low * width, high * width, push / width
-    step = jnp.zeros_like(push)
-    stuck = ((low >= 0) & (push > 0)) | ((high <= 0) & (push < 0))
-    for _ in range(3):
-        # What would leave its bounds stops there, and the others make up for it.
-        held = jnp.where(stuck, jnp.clip(step, low, high), 0.0)
-        matrix = jnp.where(stuck[:, None] | stuck, jnp.eye(len(push)), scaled)
-        right = jnp.where(stuck, held, -push - scaled @ held)
-        step = solve(matrix, right)
-        stuck = stuck | (step < low) | (step > high)
-    step = jnp.clip(step, low, high) / width
-    start_step = jnp.zeros_like(point.start)
-    if initials:
-        start_step = start_step.at[:, :initials].set(-inner[..., -1] - inner[..., :-1] @ step)
-    # Initial states follow the parameters, so that the reduced problem is the whole promise.
-    wide = step * width
-    return step, start_step, -2 * push @ wide - wide @ (scaled @ wide)
+def _solver(problem: Problem) -> LevenbergMarquardt:
+    return LevenbergMarquardt(descent=BoundedDescent(problem.lower, problem.upper))
 
 
 def _settle(
     problem: Problem, near: Sensitivity, theta: Float[Array, " values"], start, steps: int
 ) -> tuple[Float[Array, " values"], Float[Array, "recordings initials"]]:
     """Steps with the simulation's sensitivities of close by, and everything else exact."""
-    n, own = problem.loop.joints, problem.loop.theta.shape[0]
+    n, own, solver = problem.loop.joints, problem.loop.theta.shape[0], _solver(problem)
 
     def point_at(theta, start) -> Point:
         batch = dataclasses.replace(problem.batch, q0=start[:, :n], v0=start[:, n:])
         loop = problem.loop.with_theta(theta[:own])
         raw = raw_residual(loop, batch, problem.weights, problem.signals)
         plain = dataclasses.replace(near, raw=raw, residual=raw)
-        return products(problem, theta, start, problem.whitened(plain, theta[own:]))
+        return problem.around(theta, start, problem.whitened(plain, theta[own:]))
 
     def body(carry, _):
-        theta, start, best, damping = carry
-        point = point_at(theta, start)
-        better = point.loss <= best[2]
-        kept = (point.theta, point.start, point.loss)
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), kept, best)
-        # After a step that failed the next is shorter, from where it began.
-        damping = jnp.where(better, 0.0, jnp.maximum(10 * damping, 1e-1))
-        low, high = problem.lower - theta, problem.upper - theta
-        step, start_step, _ = _bounded_step(point, low, high, damping)
-        ahead = (theta + step, start + start_step)
-        theta, start = jax.tree.map(lambda a, b: jnp.where(better, a, b), ahead, best[:2])
-        return (theta, start, best, damping), None
+        y, state = carry
+        trial, estimated = state.y_eval
+        point = point_at(trial, estimated if problem.free_start else start)
+        options = {"linearised": point.sums.products(point.loss), "rows": problem.batch.kept.size}
+        y, state, _ = solver.step(None, y, None, options, state, frozenset())
+        return (y, state), None
 
-    theta = jnp.clip(theta, problem.lower, problem.upper)
-    first = (theta, start, (theta, start, jnp.asarray(jnp.inf)), jnp.zeros(()))
-    (theta, start, _, _), _ = jax.lax.scan(body, first, None, length=steps)
-    return theta, start
+    y = problem.unknowns(jnp.clip(theta, problem.lower, problem.upper), start)
+    state = solver.init(None, y, None, {}, None, None, frozenset())
+    (y, state), _ = jax.lax.scan(body, (y, state), None, length=steps)
+    # The next trial point: where the last step leads, which was not evaluated yet.
+    theta, estimated = state.y_eval
+    return theta, estimated if problem.free_start else start
+
+
+def _last_step(
+    problem: Problem, point: Point
+) -> tuple[Float[Array, " values"], Float[Array, "recordings initials"], Float[Array, ""]]:
+    """A full step, and how much it should lower the loss."""
+    descent = _solver(problem).descent
+    y, products = problem.unknowns(point.theta, point.start), point.sums.products(point.loss)
+    state = descent.query(y, products, descent.init(y, jax.tree.map(jnp.zeros_like, products)))
+    (step, moved), _ = descent.step(jnp.asarray(1e12), state)
+    moved = moved if problem.free_start else jnp.zeros_like(point.start)
+    estimated = moved if problem.free_start else moved[:0, :0]
+    return step, moved, 2 * promised((step, estimated), products)
 
 
 def _own_columns(problem: Problem, point: Point) -> Float[Array, "recordings samples outputs p"]:
@@ -192,7 +169,7 @@ def _changed(
     )
 
 
-@eqx.filter_jit
+@compiled
 def _refit_some(optimum: Optimum, lanes: Lanes, steps: int) -> Refitted:
     problem, start = optimum.problem, jnp.asarray(optimum.start)
     n, own = problem.loop.joints, problem.loop.theta.shape[0]
@@ -209,8 +186,7 @@ def _refit_some(optimum: Optimum, lanes: Lanes, steps: int) -> Refitted:
         )
         theta, initials = _settle(mine, near, lane.theta, start, steps)
         point = point_around(mine, theta, initials)
-        low, high = mine.lower - theta, mine.upper - theta
-        step, moved, promise = _bounded_step(point, low, high, jnp.zeros(()))
+        step, moved, promise = _last_step(mine, point)
         found = point.found
         last = promise / (point.loss / jnp.sum(found.residual != 0))
         columns = _own_columns(mine, point)
@@ -264,7 +240,7 @@ def redrawn(
             "noise cannot be drawn for a virtual controller, which compares a part of the torque "
             "only: give the loop its own controller"
         )
-    found = linearise(problem, jnp.asarray(optimum.theta), jnp.asarray(optimum.start)).found
+    found = linearise(problem, optimum.theta, optimum.start)
     clean = np.asarray(measured_of(problem)) - np.asarray(found.raw / problem.weights)
     draws = len(noise[0])
     signals = np.repeat(clean[None], draws, axis=0)

@@ -1,21 +1,24 @@
 """From signals to a linear regression: filtered motion, columns, decimation."""
 
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Array, Float
 
+from ..compiling import compiled
 from ..effects import Motion
 from ..errors import FitError
 from ..parameters import Parameter, read_values, write_values
 from ..recording import Recording
 from ..signals.smoothing import even_times, resampled, signal_cutoff, smooth_motion
-from ..simulation.loop import ClosedLoop, inverse
-from ..simulation.runs import Simulated, recording_label
+from ..simulation.batch import recording_label
+from ..simulation.dynamics import inverse
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import Simulated
 
 
 class Filtering(eqx.Module):
@@ -34,6 +37,10 @@ class Filtering(eqx.Module):
     rate: float | None = eqx.field(static=True, default=None)
     order: int = eqx.field(static=True, default=4)
     trim: float | None = eqx.field(static=True, default=None)
+
+    def on(self, recording: Recording) -> "Filtering":
+        """The same with its cutoff settled, so that the spectrum is looked at once."""
+        return dataclasses.replace(self, cutoff=self.settled(recording)[0])
 
     def settled(self, recording: Recording) -> tuple[float, int, int]:
         """Cutoff in Hz, decimation factor and samples to drop, for a recording.
@@ -125,7 +132,7 @@ def mismatch(loop: ClosedLoop, at: Motion) -> Float[Array, "samples joints"]:
     return jax.vmap(one)(at, states)
 
 
-@eqx.filter_jit
+@compiled
 def _columns(loop: ClosedLoop, at: Motion) -> tuple[Array, Array]:
     parameters = linear_parameters(loop)
     theta = read_values(loop, parameters)
@@ -162,6 +169,8 @@ def decimator(
     recording: Recording, filtering: Filtering
 ) -> Callable[[Float[np.ndarray, "samples *axes"]], Float[np.ndarray, "kept *axes"]]:
     """The parallel filter that torque and every column pass alike, and its decimation."""
+    import scipy
+
     _, factor, trim = filtering.settled(recording)
 
     def apply(x: np.ndarray) -> np.ndarray:

@@ -1,13 +1,11 @@
 """Parametric bootstrap: fits of what the fitted model and its noise would have recorded."""
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
-import plotly.graph_objects as go
 from jaxtyping import Bool, Float
 
-from ..display import figures
 from ..display.progress import working
 from ..display.shown import AbstractShown
 from ..errors import FitError
@@ -15,6 +13,10 @@ from ..noise import ARFilter, VectorAR, fit_ar, innovations, levels
 from .covariance import optimum_of
 from .refit import drawn_noise, redrawn, refit_signals
 from .result import Fit
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import plotly.graph_objects as go
 
 
 class Bootstrap(AbstractShown):
@@ -38,8 +40,10 @@ class Bootstrap(AbstractShown):
         low, high = np.quantile(self.theta, [tail, 1 - tail], axis=0)
         return np.stack([2 * self.fit.theta - high, 2 * self.fit.theta - low], axis=1)
 
-    def table(self, level: float = 0.95) -> pd.DataFrame:
+    def table(self, level: float = 0.95) -> "pd.DataFrame":
         """Value, bias, deviation, interval and unit of each parameter."""
+        import pandas as pd
+
         low, high = self.interval(level).T
         return pd.DataFrame(
             {
@@ -59,8 +63,10 @@ class Bootstrap(AbstractShown):
         said = f"parametric bootstrap of {len(self.theta)} draws"
         return dataclasses.replace(self.fit, covariance=covariance, deviations=said)
 
-    def plot(self) -> go.Figure:
+    def plot(self) -> "go.Figure":
         """The parameters with the deviations of the draws."""
+        from ..display import figures
+
         names, units = list(self.fit.names), list(self.fit.units)
         return figures.parameters(names, self.fit.theta, self.std, units)
 

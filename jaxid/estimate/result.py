@@ -6,22 +6,22 @@ import html
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import numpy as np
-import pandas as pd
-import plotly.graph_objects as go
 from jaxtyping import Float
 
-from ..display import figures
 from ..display.shown import AbstractShown
-from ..errors import FitError
+from ..errors import FitError, check_words
 from ..noise import ARFilter, VectorAR, innovations, ljung_box
 from ..recording import Recording, Recordings
-from ..settings import check_words
 from ..simulation.loop import ClosedLoop
 from ..storage.saved import save
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import plotly.graph_objects as go
 
 
 class Status(enum.Enum):
@@ -35,6 +35,27 @@ class Status(enum.Enum):
     overflowed = "its numbers leave what float64 holds; check the units of the recordings"
     unphysical = "ended at values that no robot has: the mass matrix is not positive definite"
     misfit = "describes the recordings no better than no model would"
+    out_of_solver_steps = (
+        "the integration ran out of steps before a recording's end; raise Stepping(max_steps=...), "
+        "loosen the tolerances of its controller, or choose an implicit solver"
+    )
+    smallest_solver_step = (
+        "the integration's step fell below the smallest one allowed; choose an implicit solver, or "
+        "look for a value that makes the loop so stiff"
+    )
+    implicit_step_failed = (
+        "an implicit step found no solution; take smaller steps or another solver"
+    )
+
+    @property
+    def simulated(self) -> bool:
+        """Whether there were values at which the loop could be simulated."""
+        return self not in (
+            Status.diverged,
+            Status.out_of_solver_steps,
+            Status.smallest_solver_step,
+            Status.implicit_step_failed,
+        )
 
 
 class Fit(AbstractShown):
@@ -58,7 +79,7 @@ class Fit(AbstractShown):
     status: Status = eqx.field(static=True)
     covariance: Float[np.ndarray, "parameters parameters"]
     residuals: tuple[Float[np.ndarray, "_samples joints"], ...]
-    error_percent: pd.DataFrame
+    error_percent: "pd.DataFrame"
     iterations: int = eqx.field(static=True, default=0)
     simulations: int = eqx.field(static=True, default=0)
     seconds: float = eqx.field(static=True, default=0.0)
@@ -107,13 +128,15 @@ class Fit(AbstractShown):
             noise = noise[: self.loop.joints]
         return tuple(innovations(r, noise) for r in self.residuals)
 
-    def whiteness(self, lags: int = 38) -> pd.DataFrame:
+    def whiteness(self, lags: int = 38) -> "pd.DataFrame":
         """Ljung and Box's test of residuals and innovations by joint, and the filter's order.
 
         **Arguments:**
 
         - `lags`: at least; twenty more than the order of a filter.
         """
+        import pandas as pd
+
         rows = []
         for j in range(self.loop.joints):
             order = 0
@@ -129,8 +152,10 @@ class Fit(AbstractShown):
         index = pd.Index(joint_columns(self.loop.joints), name="joint")
         return pd.DataFrame(rows, columns=columns, index=index)
 
-    def table(self) -> pd.DataFrame:
+    def table(self) -> "pd.DataFrame":
         """Value, unit, standard deviation and relative deviation (A.4) of each parameter."""
+        import pandas as pd
+
         value, std = self.theta, self.std
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = np.where(value != 0, 100 * std / np.abs(value), np.inf)
@@ -170,8 +195,10 @@ class Fit(AbstractShown):
         """
         return save(self, path)
 
-    def plot(self) -> go.Figure:
+    def plot(self) -> "go.Figure":
         """The parameters with their deviations."""
+        from ..display import figures
+
         std = np.where(np.isfinite(self.std), self.std, np.nan)
         return figures.parameters(list(self.names), self.theta, std, list(self.units))
 
@@ -223,8 +250,10 @@ def relative_errors(
     recordings: Recordings | Sequence[Recording],
     measured: Sequence[Float[np.ndarray, "_samples joints"]],
     residuals: Sequence[Float[np.ndarray, "_samples joints"]],
-) -> pd.DataFrame:
+) -> "pd.DataFrame":
     """100 · ‖residual‖ / ‖measured‖ by recording and joint (Table 3 of Brunot et al. 2016)."""
+    import pandas as pd
+
     # Of a loop that runs away the error is infinite, which is no cause for a warning.
     with np.errstate(over="ignore"):
         rows = [
@@ -235,7 +264,7 @@ def relative_errors(
     return pd.DataFrame(rows, index=names, columns=joint_columns(measured[0].shape[1]))
 
 
-def errors_to_dict(errors: pd.DataFrame) -> dict[str, list[float | None]]:
+def errors_to_dict(errors: "pd.DataFrame") -> dict[str, list[float | None]]:
     """Relative errors as JSON: a list of joints for each recording."""
     return {
         str(name): [float(x) if np.isfinite(x) else None for x in row]

@@ -7,8 +7,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..errors import check_words
 from ..recording import Recording
-from ..settings import check_words
 from ..signals.fourier import Harmonics, fourier_basis, period_of, settle_harmonics
 from ..signals.smoothing import even_times, low_pass, resampled
 from ..simulation.runs import Simulated

@@ -1,6 +1,5 @@
 """What a reference would tell about the parameters: information matrices, differentiable."""
 
-import dataclasses
 from typing import Literal
 
 import equinox as eqx
@@ -9,12 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..compiling import compiled
 from ..effects import AbstractEffect, Motion
+from ..errors import check_words
 from ..estimate.regression import linear_parameters, mismatch
 from ..parameters import Parameter, read_values, write_values
-from ..settings import check_words
+from ..simulation.batch import NOBODY, Interval
+from ..simulation.integration import initial
 from ..simulation.loop import ClosedLoop
-from ..simulation.runs import NOBODY, Interval, initial, run_with_sensitivities
+from ..simulation.runs import run_with_sensitivities
+from ..simulation.steps import with_reverse_mode
 
 Kind = Literal["inverse-dynamics", "closed-loop"]
 Criterion = Literal["determinant", "deviation", "condition"]
@@ -31,7 +34,7 @@ def along(
     return jax.vmap(Motion)(time, q, v, a, tau, jnp.zeros((n, 0)), jnp.full(n, NOBODY))
 
 
-@eqx.filter_jit
+@compiled
 def torque_along(
     loop: ClosedLoop, time: Float[Array, " points"], signals: Float[Array, "3 points joints"]
 ) -> Float[Array, "points joints"]:
@@ -39,7 +42,7 @@ def torque_along(
     acting = [type(e).command is not AbstractEffect.command for e in loop.effects]
     lags = [on and e.initial_state().size for e, on in zip(loop.effects, acting, strict=True)]
     prompt = [e for e, late in zip(loop.effects, lags, strict=True) if not late]
-    loop = dataclasses.replace(loop, effects=prompt)
+    loop = loop.with_effects(prompt)
 
     def lacking(tau):
         return mismatch(loop, along(time, signals, tau))
@@ -60,7 +63,7 @@ def chosen_parameters(loop: ClosedLoop, kind: Kind) -> tuple[Parameter, ...]:
     return linear_parameters(loop) if kind == "inverse-dynamics" else loop.free_parameters
 
 
-@eqx.filter_jit
+@compiled
 def inverse_columns(
     loop: ClosedLoop, time: Float[Array, " points"], signals: Float[Array, "3 points joints"]
 ) -> Float[Array, "points joints parameters"]:
@@ -100,7 +103,7 @@ def intervals_of(
     )
 
 
-@eqx.filter_jit
+@compiled
 def closed_loop_columns(
     loop: ClosedLoop,
     time: Float[Array | np.ndarray, " points"],
@@ -110,6 +113,8 @@ def closed_loop_columns(
 
     **Returns:** `(points, 3, joints)`, and the derivative of torque by the free parameters.
     """
+    # A design follows the gradient of these columns.
+    loop = with_reverse_mode(loop, len(time))
     intervals = intervals_of(loop, time, signals)
     q0, v0 = signals[0, 0], jnp.zeros_like(signals[0, 0])
     theta = loop.theta
@@ -118,7 +123,8 @@ def closed_loop_columns(
         return initial(loop.with_theta(values), intervals, q0, v0)
 
     x0, start = begin(theta), jax.jacfwd(begin)(theta)
-    seen, by = run_with_sensitivities(loop, intervals, x0, start, (0, 1, 2))
+    found = run_with_sensitivities(loop, intervals, x0, start, (0, 1, 2))
+    seen, by = found.seen, found.slopes
     return seen, by[:, 0]
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -105,3 +106,24 @@ class PlanarReach(eqx.Module):
         lengths = jnp.asarray(self.lengths)
         x, y = jnp.sum(lengths * jnp.cos(angle)), jnp.sum(lengths * jnp.sin(angle))
         return jnp.stack([x - self.low[0], self.high[0] - x, y - self.low[1], self.high[1] - y])
+
+
+# The limits of a joint, in the order of `margins_along`: magnitudes have two sides.
+SIDES = ("low", "high", "speed", "speed", "acceleration", "acceleration", "torque", "torque")
+
+
+def margins_along(
+    limits: Limits,
+    signals: Float[Array, "3 points joints"],
+    tau: Float[Array, "points joints"],
+) -> tuple[Float[Array, "points 8 joints"], Float[Array, "points sides"]]:
+    """How far a motion is from each limit, as a share of it; negative where it is passed."""
+    q, v, a = signals
+    span = limits.high - limits.low
+    rates = [(v, limits.speed), (a, limits.acceleration), (tau, limits.torque)]
+    rows = [(q - limits.low) / span, (limits.high - q) / span]
+    rows += [1 + sign * x / most for x, most in rates for sign in (-1.0, 1.0)]
+    inside = jnp.zeros((q.shape[0], 0))
+    if limits.workspace is not None:
+        inside = jax.vmap(limits.workspace)(q)
+    return jnp.stack(rows, axis=1), inside

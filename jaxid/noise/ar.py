@@ -1,16 +1,17 @@
 """Autoregressive noise filters H = 1/A, one a joint."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import equinox as eqx
 import numpy as np
-import pandas as pd
-import scipy
 from jaxtyping import Float
 
 from ..errors import NoiseError
 from .whiteness import levelled, ljung_box
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Criterion = Literal["aic", "aicc", "bic"]
 
@@ -81,6 +82,8 @@ class ARFilter(eqx.Module):
 
     def whiten(self, x: Float[np.ndarray, "samples *axes"]) -> Float[np.ndarray, "samples *axes"]:
         """A(z) x along the first axis; what came before the first sample counts as zero."""
+        import scipy
+
         return np.asarray(
             scipy.signal.lfilter(self.polynomial, [1.0], np.asarray(x, float), axis=0)
         )
@@ -101,6 +104,8 @@ class ARFilter(eqx.Module):
         self, shape: tuple[int, ...], rng: np.random.Generator
     ) -> Float[np.ndarray, "*shape"]:
         """Stationary noise from the first sample on, along the last axis of `shape`."""
+        import scipy
+
         filt = self.stabilised()
         slowest = max(np.abs(np.roots(filt.polynomial)), default=0.0)
         # What the first samples remember of a start at zero has sunk to a ten-thousandth.
@@ -192,7 +197,7 @@ def fit_ar(
 
 def orders(
     series: Sequence[Float[np.ndarray, " _"]], highest: int = 50, lags: int = 38
-) -> pd.DataFrame:
+) -> "pd.DataFrame":
     """Innovation variance, AIC, AICc, BIC and whiteness of every order up to `highest`.
 
     **Arguments:**
@@ -205,7 +210,7 @@ def orders(
     return Burg.of(series, most).orders(True, lags)
 
 
-def choose(table: pd.DataFrame, criterion: Criterion, white: float | None = None) -> int:
+def choose(table: "pd.DataFrame", criterion: Criterion, white: float | None = None) -> int:
     """The order with the least criterion, among those whose innovations pass for white if any do.
 
     (As CAPTAIN's `aic` does, Young 2011.)
@@ -256,8 +261,10 @@ class Burg(eqx.Module):
         floored = np.array([variances[0], *np.maximum(variances[1:], 1e-300)])
         return cls(found, floored, innovations, count)
 
-    def orders(self, tested: bool, lags: int = 38) -> pd.DataFrame:
+    def orders(self, tested: bool, lags: int = 38) -> "pd.DataFrame":
         """One row an order; whiteness only where `tested`, for it takes longer than the rest."""
+        import pandas as pd
+
         k = np.arange(len(self.variances))
         level = self.count * np.log(self.variances)
         table = pd.DataFrame(

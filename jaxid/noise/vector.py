@@ -1,16 +1,18 @@
 """Autoregressive noise of several joints at once, each driven by the past of all."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
-import pandas as pd
-import scipy
 from jaxtyping import Float
 
 from ..errors import NoiseError
 from .ar import ARFilter, Criterion, check_series, choose
 from .whiteness import levelled
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class VectorAR(eqx.Module):
@@ -58,6 +60,8 @@ class VectorAR(eqx.Module):
         self, x: Float[np.ndarray, "samples outputs"]
     ) -> Float[np.ndarray, "samples outputs"]:
         """e of a noise; what came before the first sample counts as zero."""
+        import scipy
+
         taps = self.taps(self.order + 1)
         return np.stack(
             [
@@ -129,7 +133,9 @@ def fit_var(
     return found[order]
 
 
-def _criteria(found: Sequence[VectorAR], count: int) -> pd.DataFrame:
+def _criteria(found: Sequence[VectorAR], count: int) -> "pd.DataFrame":
+    import pandas as pd
+
     k = np.array([f.coefficients.size + f.covariance.size for f in found])
     level = np.array([count * np.linalg.slogdet(f.covariance)[1] for f in found])
     room = np.maximum(count - k / found[0].outputs - 1, 1)
@@ -145,6 +151,8 @@ def _nuttall_strand(
     series: Sequence[Float[np.ndarray, "_samples outputs"]], most: int
 ) -> list[VectorAR]:
     """Filters of every order up to the highest."""
+    import scipy
+
     forward = [x.T for x in series]
     backward = list(forward)
     power = sum(f @ f.T for f in forward) / sum(f.shape[1] for f in forward)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-import scipy
 from jaxtyping import Float
 
 
@@ -84,6 +83,8 @@ def ljung_box(
     - `lags`: how many.
     - `fitted`: coefficients that were estimated from them.
     """
+    import scipy
+
     covariance = autocovariance(levelled(series), lags)
     total = sum(len(x) for x in series)
     if covariance[0] <= 0:

@@ -5,11 +5,10 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Bool, Float64
 
-from ..errors import JaxidWarning
-from ._problem import brief, problem
+from ..errors import JaxidWarning, brief
+from ._problem import problem
 from ._units import SIGNALS, Units, factors
 
 Gaps = Literal["refuse", "allow"]
@@ -30,6 +29,8 @@ def numeric(source: str, column: str, values: object) -> Float64[np.ndarray, "..
 
     **Raises:** `RecordingError` for text, objects, booleans, dates, complex or ragged values.
     """
+    import pandas as pd
+
     try:
         if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "iuf":
             values = np.ma.filled(values.astype(np.float64), np.nan)

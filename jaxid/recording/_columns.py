@@ -4,15 +4,19 @@ import contextlib
 import itertools
 import re
 from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
-import pandas as pd
 from jaxtyping import Float64
 
+from ..errors import brief, near
 from ._checks import numeric
-from ._problem import brief, near, problem
+from ._problem import problem
 from ._units import SIGNALS
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Columns = Mapping[str, str | Sequence[str]]
 
@@ -91,7 +95,7 @@ def pick(source: str, table: Table, columns: Columns | None) -> Picked:
     return Picked(signals, labels, known is not None and known[0].quantised)
 
 
-def from_frame(source: str, frame: pd.DataFrame) -> Table:
+def from_frame(source: str, frame: "pd.DataFrame") -> Table:
     """The columns of a DataFrame, each named once."""
     names = [str(name).strip() for name in frame.columns]
     unique(source, names)

@@ -10,15 +10,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
-import scipy
 
-from ..errors import JaxidError, RecordingError, require
-from ..storage.archive import npy
+from ..errors import JaxidError, RecordingError, brief, require
+from ..storage.arrays import npy
 from ._checks import Gaps, is_number
 from ._columns import Columns, Table, from_frame, pick, unique
 from ._matlab import order_of, variables
-from ._problem import brief, problem
+from ._problem import problem
 from ._recording import Recording, Recordings, build
 from ._units import Units
 
@@ -149,6 +147,8 @@ def _gunzip(source: str, data: bytes, largest: int) -> bytes:
 
 
 def _text(source: str, data: bytes, largest: int) -> Table:
+    import pandas as pd
+
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -253,6 +253,8 @@ def _mat(source: str, data: bytes, largest: int) -> Table:
 
 def _version_4(data: bytes) -> list[tuple[str, np.ndarray | str]]:
     """Variables of a MATLAB file of version 4, which knows no compression."""
+    import scipy
+
     # Anything else SciPy would take for version 5, and read with less care than `variables`.
     if 0 not in data[:4]:
         raise ValueError("it is of neither version 4 nor version 5")

@@ -3,17 +3,20 @@
 import html
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from typing import overload
+from typing import TYPE_CHECKING, overload
 
 import equinox as eqx
 import numpy as np
-import pandas as pd
 from jaxtyping import Float64
 
+from ..errors import brief, near
 from ._checks import Gaps, numeric, validate
 from ._columns import Columns, Picked, from_frame, pick, quantum
-from ._problem import brief, near, problem
+from ._problem import problem
 from ._units import SIGNALS, Units
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class Recording(eqx.Module):
@@ -84,7 +87,7 @@ class Recording(eqx.Module):
     @classmethod
     def from_dataframe(
         cls,
-        frame: pd.DataFrame,
+        frame: "pd.DataFrame",
         *,
         columns: Columns | None = None,
         name: str | None = None,
@@ -152,8 +155,10 @@ class Recording(eqx.Module):
         cut = {signal: values[start:stop] for signal, values in _signals(self).items()}
         return Recording(**cut, resolution=self.resolution, name=self.name)
 
-    def to_dataframe(self) -> pd.DataFrame:
+    def to_dataframe(self) -> "pd.DataFrame":
         """One row for each sample; `from_dataframe` gives the same recording back."""
+        import pandas as pd
+
         columns = {}
         for signal, values in _signals(self).items():
             if signal == "time":

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from ._problem import near, problem
+from ..errors import near
+from ._problem import problem
 
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _POSITION = {

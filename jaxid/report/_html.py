@@ -100,3 +100,13 @@ def figure(
     data = Markup((drawn.to_json() or "").replace("<", "\\u003c"))
     script = tag("script", data, type="application/json")
     return tag("figure", tag("div", box, script, class_="scroll"), tag("figcaption", caption))
+
+
+def section(title: str, *content: Content) -> Markup:
+    """A section under its heading."""
+    return tag("section", tag("h2", title), *content, id=anchor(title))
+
+
+def anchor(title: str) -> str:
+    """What a link to a section calls it."""
+    return "-".join("".join(c if c.isalnum() else " " for c in title.lower()).split())

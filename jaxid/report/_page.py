@@ -3,15 +3,13 @@
 from importlib import resources
 from pathlib import Path
 
-from plotly.offline import get_plotlyjs
-
 from ..discovery import Discovery
 from ..errors import ModelError
 from ._html import Markup, join, tag
 from ._sections import body
 
 
-def write(story: Discovery, path: str | Path) -> Path:
+def write_report(story: Discovery, path: str | Path) -> Path:
     """Writes a discovery as one self-contained HTML page.
 
     **Arguments:**
@@ -32,6 +30,8 @@ def write(story: Discovery, path: str | Path) -> Path:
 
 def page(story: Discovery) -> str:
     """The page as text."""
+    from plotly.offline import get_plotlyjs
+
     meta = (
         Markup('<meta charset="utf-8">'),
         Markup('<meta name="viewport" content="width=device-width, initial-scale=1">'),

@@ -2,7 +2,6 @@
 
 import equinox as eqx
 import numpy as np
-import scipy
 from jaxtyping import Array, Float
 
 from ..errors import FitError
@@ -88,6 +87,8 @@ def period_of(recording: Recording, period: float | None = None) -> float:
 
     **Raises:** `FitError` where the motion does not repeat.
     """
+    import scipy
+
     n, rate = recording.samples, recording.rate
     if period is not None:
         lag = round(period * rate)
@@ -155,6 +156,8 @@ def settle_harmonics(recording: Recording, period: float, harmonics: int | None)
 
     **Raises:** `FitError` where there are too few samples in a period for the harmonics.
     """
+    import scipy
+
     inside = min(recording.samples, round(period * recording.rate))
     most = (inside - 2) // 4
     if harmonics is not None:
@@ -241,6 +244,8 @@ def resampled_at(
     at: Float[np.ndarray, " points"],
 ) -> Float[np.ndarray, "points columns"]:
     """Even samples at times among them: as they are where the two coincide, else by a cubic."""
+    import scipy
+
     place = (at - time[0]) / (time[1] - time[0])
     near = np.round(place).astype(int)
     if np.all(np.abs(place - near) < 1e-6):

@@ -6,7 +6,6 @@ import itertools
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Array, Bool, Float
 
 from ..errors import RecordingError
@@ -25,6 +24,8 @@ def low_pass(
     - `x`: `(samples, columns)`.
     - `rate`: samples in a second, Hz. `cutoff`: of the filter, Hz.
     """
+    import scipy
+
     sections = scipy.signal.butter(order, cutoff, fs=rate, output="sos")
     # SciPy's own choice of padding is shorter than the filter remembers, and then a signal that
     # moves at its end is bent there. A straight line would pass unchanged, so it need not pass.
@@ -55,6 +56,8 @@ def resampled(
     at: Float[np.ndarray, " samples"],
 ) -> Float[np.ndarray, "samples columns"]:
     """Samples at other times, by a cubic spline where the two differ."""
+    import scipy
+
     if np.allclose(time, at, rtol=0, atol=1e-6 * (time[1] - time[0])):
         return x
     return scipy.interpolate.CubicSpline(time, x)(at)
@@ -76,6 +79,8 @@ def signal_cutoff(recording: Recording) -> float:
     five times where speed is strongest, at most an eighth of the sample rate; a tenth of that where
     the recording is too short for a spectrum.
     """
+    import scipy
+
     n, rate = recording.samples, recording.rate
     if n < 200:
         return rate / 10
@@ -120,6 +125,8 @@ class Band(eqx.Module):
 
         **Raises:** `RecordingError` where a recording is over before the filter has settled.
         """
+        import scipy
+
         rows, kept = [], np.zeros((len(recordings), samples), bool)
         memory = max(r.rate / c for r, c in zip(recordings, cutoffs, strict=True))
         size = 1 << int(np.ceil(np.log2(samples + 4 * memory)))

@@ -1,0 +1,8 @@
+"""Closed loops, their integration, batches of recordings, and sharing over cores and devices."""
+
+from .integration import reason as reason
+from .loop import ClosedLoop as ClosedLoop
+from .runs import Simulated as Simulated
+from .runs import simulate as simulate
+from .stepping import RK4 as RK4
+from .stepping import Stepping as Stepping

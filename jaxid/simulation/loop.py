@@ -6,16 +6,14 @@ import math
 from collections.abc import Iterable
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
 
 from ..arms import AbstractArm
-from ..control import AbstractController, Reading, Reference
-from ..effects import AbstractEffect, AbstractTransmission, Motion
+from ..control import AbstractController
+from ..effects import AbstractEffect, AbstractTransmission
 from ..errors import ModelError
 from ..parameters import (
     Parameter,
+    Place,
     Vector,
     list_parameters,
     read_values,
@@ -24,15 +22,6 @@ from ..parameters import (
     write_values,
 )
 from .stepping import Stepping
-
-
-class State(eqx.Module):
-    """The loop's state: drive positions and velocities, the effects' states, the controller's."""
-
-    q: Float[Array, " joints"]
-    v: Float[Array, " joints"]
-    effects: tuple[Float[Array, " _"], ...]
-    controller: Float[Array, " states"]
 
 
 class ClosedLoop(eqx.Module):
@@ -44,8 +33,8 @@ class ClosedLoop(eqx.Module):
     - `controller`: acts on what the sensors read.
     - `effects`: friction and whatever else; the order is that of the signal through the drive.
     - `name`: how results call the robot.
-    - `held`: names of parameters that fits leave at their values.
-    - `freed`: names of parameters that fits estimate although they are not free by declaration.
+    - `held`: places of parameters that fits leave at their values; names are turned into places.
+    - `freed`: places of those that fits estimate although they are not free by declaration.
     - `resolution`: step of the simulated encoders, `(joints,)`, rad or m; None for ideal ones.
     - `stepping`: how it is integrated.
     """
@@ -54,10 +43,16 @@ class ClosedLoop(eqx.Module):
     controller: AbstractController
     effects: tuple[AbstractEffect, ...] = eqx.field(default=(), converter=tuple)
     name: str = eqx.field(static=True, default="robot")
-    held: frozenset[str] = eqx.field(static=True, default=frozenset(), converter=frozenset)
-    freed: frozenset[str] = eqx.field(static=True, default=frozenset(), converter=frozenset)
+    # By place, for a name may become another's as effects come and go.
+    held: frozenset[Place] = eqx.field(static=True, default=frozenset(), converter=frozenset)
+    freed: frozenset[Place] = eqx.field(static=True, default=frozenset(), converter=frozenset)
     resolution: tuple[float, ...] | None = eqx.field(static=True, default=None)
     stepping: Stepping = Stepping()
+
+    def __post_init__(self):
+        # Here converters have not run yet.
+        self.effects = tuple(self.effects)
+        self.held, self.freed = self._places(self.held), self._places(self.freed)
 
     def __check_init__(self):
         for effect in self.effects:
@@ -91,8 +86,18 @@ class ClosedLoop(eqx.Module):
         return tuple(
             p
             for p in self.parameters
-            if (p.declaration.free or p.name in self.freed) and p.name not in self.held
+            if (p.declaration.free or p.place in self.freed) and p.place not in self.held
         )
+
+    @property
+    def held_names(self) -> frozenset[str]:
+        """Names of the parameters that fits leave at their values on request."""
+        return frozenset(p.name for p in self.parameters if p.place in self.held)
+
+    @property
+    def freed_names(self) -> frozenset[str]:
+        """Names of the parameters that fits estimate on request."""
+        return frozenset(p.name for p in self.parameters if p.place in self.freed)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -136,8 +141,7 @@ class ClosedLoop(eqx.Module):
 
         **Raises:** `ModelError` for a name it does not have.
         """
-        chosen = {*names, *values}
-        self._check_names(chosen)
+        chosen = self._places({*names, *values})
         loop = self.with_values(**values) if values else self
         return dataclasses.replace(loop, held=loop.held | chosen, freed=loop.freed - chosen)
 
@@ -146,18 +150,21 @@ class ClosedLoop(eqx.Module):
 
         **Raises:** `ModelError` for a name it does not have.
         """
-        self._check_names(names)
-        return dataclasses.replace(
-            self, held=self.held - frozenset(names), freed=self.freed | frozenset(names)
-        )
+        chosen = self._places(names)
+        return dataclasses.replace(self, held=self.held - chosen, freed=self.freed | chosen)
 
-    def _check_names(self, names: Iterable[str]) -> None:
-        known = [p.name for p in self.parameters]
-        for name in names:
-            if name not in known:
+    def _places(self, given: Iterable[str | Place]) -> frozenset[Place]:
+        """Places of parameters that are given by name or by place."""
+        given = list(given)
+        if not any(isinstance(one, str) for one in given):
+            return frozenset(given)  # type: ignore[arg-type]
+        known = {p.name: p.place for p in self.parameters}
+        for one in given:
+            if isinstance(one, str) and one not in known:
                 raise ModelError(
-                    f"there is no parameter {name!r} in this model: it has {', '.join(known)}"
+                    f"there is no parameter {one!r} in this model: it has {', '.join(known)}"
                 )
+        return frozenset(known[one] if isinstance(one, str) else one for one in given)
 
     def add(self, *effects: AbstractEffect) -> "ClosedLoop":
         """The same loop with more effects."""
@@ -168,19 +175,22 @@ class ClosedLoop(eqx.Module):
 
         A parameter's name may change as another of its kind comes or goes.
         """
-        loop = dataclasses.replace(self, effects=tuple(effects))
-        places = {id(effect): k for k, effect in enumerate(loop.effects)}
-        names = {p.where.steps: p.name for p in loop.parameters}  # type: ignore[attr-defined]
-        moved = {}
-        for p in self.parameters:
-            first, *steps = p.where.steps  # type: ignore[attr-defined]
-            if first == "effects":
-                steps[0] = places.get(id(self.effects[steps[0]]))
-            moved[p.name] = names.get((first, *steps))
+        after = tuple(effects)
+        left = list(enumerate(after))
+        now: dict[str | int, int] = {}
+        for k, effect in enumerate(self.effects):
+            found = next((pair for pair in left if pair[1] is effect), None)
+            if found is not None:
+                left.remove(found)
+                now[k] = found[0]
+
+        def moved(places: frozenset[Place]) -> frozenset[Place]:
+            others = {place for place in places if place[0] != "effects"}
+            kept = [place for place in places - others if place[1] in now]
+            return frozenset(others) | {("effects", now[p[1]], *p[2:]) for p in kept}
+
         return dataclasses.replace(
-            loop,
-            held=frozenset(moved.get(name) for name in self.held) - {None},
-            freed=frozenset(moved.get(name) for name in self.freed) - {None},
+            self, effects=after, held=moved(self.held), freed=moved(self.freed)
         )
 
     def without(self, name: str, joint: int | None = None) -> "ClosedLoop":
@@ -206,6 +216,10 @@ class ClosedLoop(eqx.Module):
                 f"there is no effect {name!r}{where} to take away: the loop has {', '.join(there)}"
             )
         return self.with_effects(kept)
+
+    def of_format(self, written: int) -> "ClosedLoop":
+        """The loop of a saved result of an older format: the first held and freed names."""
+        return dataclasses.replace(self) if written == 1 else self
 
     def _repr_html_(self) -> str:
         rows = "".join(
@@ -237,293 +251,5 @@ def _row(loop: ClosedLoop, p: Parameter) -> tuple[str, ...]:
     low, high = p.declaration.lower, p.declaration.upper
     bounds = [f"≥ {low:g}" if low > -math.inf else "", f"≤ {high:g}" if high < math.inf else ""]
     value = "several" if p.several else f"{float(p.where(loop)):.4g}"
-    free = any(p.name == other.name for other in loop.free_parameters)
+    free = any(p.place == other.place for other in loop.free_parameters)
     return p.name, value, loop.unit(p), " ".join(filter(None, bounds)), "" if free else "held"
-
-
-def rest(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> State:
-    """The state at a position and velocity, `(joints,)`, with all else at rest."""
-    effects = tuple(effect.initial_state() for effect in loop.effects)
-    return State(q, v, effects, loop.controller.initial_state(read(loop, q, v)))
-
-
-def settle(
-    loop: ClosedLoop,
-    t: Float[Array, ""],
-    state: State,
-    reference: Reference,
-    label: Int[Array, ""],
-) -> State:
-    """The state with the effects' own parts as the first command finds them: none ramps up."""
-    seen = read(loop, state.q, state.v)
-    mass = loop.arm.mass_matrix(state.q)
-    tau = loop.controller.command(seen, reference, state.controller, mass)
-    motion = Motion(t, state.q, state.v, jnp.zeros_like(state.q), tau, jnp.zeros(0), label)
-    settled = []
-    for effect in loop.effects:
-        own = effect.settled(motion)
-        settled.append(own)
-        motion = dataclasses.replace(
-            motion, tau=effect.command(dataclasses.replace(motion, state=own))
-        )
-    return dataclasses.replace(state, effects=tuple(settled))
-
-
-def _sensor(loop: ClosedLoop, q: Float[Array, " joints"]) -> Float[Array, " joints"]:
-    """What sensors without steps report, `(joints,)`."""
-    for effect in loop.effects:
-        q = effect.read(q)
-    return q
-
-
-def read(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Reading:
-    """What the sensors report at a position and velocity, `(joints,)`."""
-    seen, rate = jax.jvp(lambda position: _sensor(loop, position), (q,), (v,))
-    if loop.resolution is not None:
-        step = jnp.asarray(loop.resolution)
-        # Rounding has no slope; sensitivities go through as if the encoder were ideal.
-        seen = seen + jax.lax.stop_gradient(step * jnp.round(seen / step) - seen)
-    return Reading(seen, rate)
-
-
-def behind(
-    loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]
-) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
-    """Position and velocity at which the sensors report these, `(joints,)` each."""
-    if all(type(effect).read is AbstractEffect.read for effect in loop.effects):
-        return q, v
-
-    def position(reading: Float[Array, " joints"]) -> Float[Array, " joints"]:
-        guess = reading
-        # Errors of sensors are some hundredths of what they read: each turn gains two digits.
-        for _ in range(6):
-            guess = guess + reading - _sensor(loop, guess)
-        return guess
-
-    return jax.jvp(position, (q,), (v,))
-
-
-def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Solves a small positive-definite system, unrolled: LAPACK's call costs more than the sums."""
-    n = right.shape[0]
-    rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
-    b = [right[i] for i in range(n)]
-    for k in range(n):
-        for i in range(k + 1, n):
-            factor = rows[i][k] / rows[k][k]
-            rows[i] = [rows[i][j] - factor * rows[k][j] for j in range(n)]
-            b[i] = b[i] - factor * b[k]
-    x: list[Float[Array, ""]] = [b[0]] * n
-    for i in reversed(range(n)):
-        rest_of_row = sum((rows[i][j] * x[j] for j in range(i + 1, n)), jnp.zeros(()))
-        x[i] = (b[i] - rest_of_row) / rows[i][i]
-    return jnp.stack(x)
-
-
-class Outside(eqx.Module):
-    """What comes from outside the loop at one instant; vectors are `(joints,)`.
-
-    `push` is torque on the drives, `pull` on the links (the same where nothing gives way between
-    them and nothing depends on the load), `noise` is added to what the sensors read.
-    """
-
-    push: Float[Array, " joints"]
-    pull: Float[Array, " joints"]
-    noise: Reading
-
-
-class Instant(eqx.Module):
-    """Everything about one instant of the loop; vectors are `(joints,)`.
-
-    `command` is what the controller asks for and what gets recorded, `tau` what the drives
-    deliver, `a` the acceleration of the drives.
-    """
-
-    reading: Reading
-    command: Float[Array, " joints"]
-    tau: Float[Array, " joints"]
-    a: Float[Array, " joints"]
-    derivative: State
-
-
-def effect_loads(
-    loop: ClosedLoop,
-    motion: Motion,
-    states: tuple[Float[Array, " _"], ...],
-    links: Motion | None = None,
-    *,
-    push: Float[Array, " joints"] | float = 0.0,
-    curves: bool = True,
-    inertia: bool = True,
-) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
-    """Torque that all effects together ask of the drives, and that of the links, `(joints,)` each.
-
-    Effects of the load come last, since they are given what the others leave of the torque; what
-    is proportional to acceleration, which is solved for, is not taken off it.
-
-    **Arguments:**
-
-    - `motion`: of the drives. `states`: the effects' own. `links`: their motion, where they part
-      from the drives.
-    - `push`: torque on the drives from outside, which effects of the load see.
-    - `curves`: False to leave out what needs an acceleration that is not known yet.
-    - `inertia`: False to leave out what is proportional to acceleration.
-    """
-    drive = link = ahead = jnp.zeros_like(motion.v)
-    behind = motion if links is None else links
-    own = [
-        (effect, state)
-        for effect, state in zip(loop.effects, states, strict=True)
-        if curves or not effect.needs_acceleration
-    ]
-    for effect, state in own:
-        if effect.loaded:
-            continue
-        seen = dataclasses.replace(behind if effect.on_link else motion, state=state)
-        if effect.inertial and not inertia:
-            seen = dataclasses.replace(seen, a=jnp.zeros_like(seen.a))
-        torque = effect.torque(seen)
-        if effect.on_link:
-            link = link + torque
-            continue
-        drive = drive + torque
-        if effect.inertial:
-            torque = effect.torque(dataclasses.replace(seen, a=jnp.zeros_like(seen.a)))
-        ahead = ahead + torque
-    left = dataclasses.replace(motion, tau=motion.tau - ahead + push)
-    for effect, state in own:
-        if effect.loaded:
-            drive = drive + effect.torque(dataclasses.replace(left, state=state))
-    return drive, link
-
-
-def inverse(
-    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...]
-) -> Float[Array, " joints"]:
-    """Torque at the joints that a motion takes (the inverse dynamic model), `(joints,)`."""
-    rigid = loop.arm.mass_matrix(motion.q) @ motion.a + loop.arm.bias(motion.q, motion.v)
-    drive, link = effect_loads(loop, motion, states)
-    return rigid + drive + link
-
-
-def _added_inertia(
-    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...]
-) -> Float[Array, "joints joints"]:
-    n = loop.joints
-    inertial = [(e, s) for e, s in zip(loop.effects, states, strict=True) if e.inertial]
-    if not inertial:
-        return jnp.zeros((n, n))
-
-    def torque(a: Float[Array, " joints"]) -> Float[Array, " joints"]:
-        at = dataclasses.replace(motion, a=a)
-        pieces = [e.torque(dataclasses.replace(at, state=s)) for e, s in inertial]
-        return sum(pieces[1:], pieces[0])
-
-    return jax.jacfwd(torque)(motion.a)
-
-
-def instant(
-    loop: ClosedLoop,
-    t: Float[Array, ""],
-    state: State,
-    reference: Reference,
-    outside: Outside,
-    label: Int[Array, ""],
-) -> Instant:
-    """The closed loop at one instant: what is read, commanded and delivered, and what follows.
-
-    **Arguments:**
-
-    - `t`: time, s.
-    - `state`: of the loop.
-    - `reference`: what the controller is asked for.
-    - `outside`: what acts on it.
-    - `label`: which recording.
-    """
-    seen = read(loop, state.q, state.v)
-    seen = Reading(seen.q + outside.noise.q, seen.v + outside.noise.v)
-    mass = loop.arm.mass_matrix(state.q)
-    command = loop.controller.command(seen, reference, state.controller, mass)
-    tau = loop.controller.acting(command, state.controller)
-    motion = Motion(t, state.q, state.v, jnp.zeros_like(state.q), tau, jnp.zeros(0), label)
-    # An effect's own states see what arrives at it, so that lags in a row compose.
-    arriving = []
-    for effect, own in zip(loop.effects, state.effects, strict=True):
-        arriving.append(motion.tau)
-        seen_by = dataclasses.replace(motion, state=own)
-        motion = dataclasses.replace(motion, tau=effect.command(seen_by))
-    a, twisting = _accelerations(loop, motion, state, outside)
-    rates = []
-    for k, (effect, own) in enumerate(zip(loop.effects, state.effects, strict=True)):
-        if k in twisting:
-            rates.append(jnp.stack([own[1], twisting[k]]))
-        else:
-            at = dataclasses.replace(motion, a=a, tau=arriving[k], state=own)
-            rates.append(effect.derivative(at))
-    law = loop.controller.derivative(seen, reference, state.controller)
-    return Instant(seen, command, motion.tau, a, State(state.v, a, tuple(rates), law))
-
-
-def _accelerations(
-    loop: ClosedLoop, motion: Motion, state: State, outside: Outside
-) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
-    """Accelerations of the drives, and of the twist of each transmission by its place."""
-    added = _added_inertia(loop, motion, state.effects)
-    matrix = loop.arm.mass_matrix(state.q) + added
-    bias = loop.arm.bias(state.q, state.v)
-    own = state.effects
-    if any(effect.needs_acceleration for effect in loop.effects):
-        drive, link = effect_loads(loop, motion, own, push=outside.push, curves=False)
-        without = motion.tau - drive - link + outside.push + outside.pull
-        motion = dataclasses.replace(motion, a=solve_positive(matrix, without - bias))
-    transmissions = [
-        (k, e) for k, e in enumerate(loop.effects) if isinstance(e, AbstractTransmission)
-    ]
-    if transmissions:
-        return _through_transmissions(loop, motion, state, transmissions, outside, added)
-    # What is proportional to acceleration is on the left-hand side already.
-    drive, link = effect_loads(loop, motion, own, push=outside.push, inertia=False)
-    torque = motion.tau - drive - link + outside.push + outside.pull
-    return solve_positive(matrix, torque - bias), {}
-
-
-def _through_transmissions(
-    loop: ClosedLoop,
-    motion: Motion,
-    state: State,
-    transmissions: list[tuple[int, AbstractTransmission]],
-    outside: Outside,
-    added: Float[Array, "joints joints"],
-) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
-    """Rotors on the drive's side, the rest of the inertia on the link's (Spong 1987)."""
-    q, v = state.q, state.v
-    rotors = passed = jnp.zeros_like(q)
-    apart = jnp.zeros_like(q, bool)
-    for k, transmission in transmissions:
-        j, there = transmission.joint - 1, transmission.present()
-        twist, rate = jnp.where(there, state.effects[k], 0.0)
-        q, v = q.at[j].add(twist), v.at[j].add(rate)
-        passed = passed.at[j].set(transmission.through(twist, rate))
-        apart = apart.at[j].set(there)
-        rotors = rotors.at[j].set(jnp.where(there, transmission.rotor, 0.0))
-    links = dataclasses.replace(motion, q=q, v=v)
-    drive, held = effect_loads(loop, motion, state.effects, links, push=outside.push, inertia=False)
-    available = motion.tau - drive + outside.push
-    on_link = jnp.where(apart, passed, available)
-    matrix = loop.arm.mass_matrix(q) + added - jnp.diag(rotors)
-    reaching = on_link - held + outside.pull
-    link = solve_positive(matrix, reaching - loop.arm.bias(q, v))
-    a, twisting = link, {}
-    for k, transmission in transmissions:
-        j, there = transmission.joint - 1, transmission.present()
-        turned = (available[j] - on_link[j]) / transmission.rotor
-        a = a.at[j].set(jnp.where(there, turned, link[j]))
-        twisting[k] = jnp.where(there, link[j] - turned, 0.0)
-    return a, twisting
-
-
-def sizes(loop: ClosedLoop) -> list[int]:
-    """Lengths of the parts of a state: q, v, each effect's, the controller's."""
-    zeros = jnp.zeros(loop.joints)
-    parts = jax.eval_shape(lambda: rest(loop, zeros, zeros))
-    return [math.prod(leaf.shape) for leaf in jax.tree.leaves(parts)]

@@ -78,7 +78,7 @@ class EndToEnd:
 
         jax.tree.map(place, self._room, result)
 
-    def _room_for(self, leaf: Array) -> np.ndarray:
+    def _room_for(self, leaf: Array | np.ndarray) -> np.ndarray:
         # JAX takes over memory as it is where it begins at a multiple of 64 bytes.
         shape = (self._parts * leaf.shape[0], *leaf.shape[1:])
         size = leaf.dtype.itemsize * math.prod(shape)

@@ -1,12 +1,16 @@
 """How a loop is integrated: solver, steps, interpolation of the reference."""
 
-from typing import ClassVar, Literal
+import inspect
+from typing import Any, ClassVar, Literal
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree
+import optimistix
+from jaxtyping import PyTree
+
+from ..errors import ModelError
 
 
 class RK4(diffrax.AbstractSolver):
@@ -66,14 +70,25 @@ class RK4(diffrax.AbstractSolver):
 class Stepping(eqx.Module):
     """Settings of the integration.
 
+    Every diffrax solver of ordinary differential equations as a whole can be used, with fixed steps
+    or with a step-size controller. Steps always end at samples, where the interpolated reference
+    may have a kink or a jump.
+
     **Arguments:**
 
-    - `solver`: a diffrax solver.
-    - `substeps`: steps between two samples; None to choose by the loop's fastest time constant.
-    - `control`: a diffrax step-size controller; None for fixed steps, which are the fastest.
-    - `adjoint`: of each adaptive solve; fixed steps are differentiated directly.
+    - `solver`: a diffrax solver. An implicit one whose root finder has no tolerances of its own
+      takes them from `control`; with fixed steps it gets Newton's method to 1e-9.
+    - `substeps`: fixed steps between two samples; None to choose by the loop's fastest time
+      constant. With a controller, the first step is tried this many times shorter than a sample.
+    - `control`: an adaptive diffrax step-size controller, in seconds; None for fixed steps, which
+      are the fastest.
+    - `adjoint`: how a run is differentiated. Sensitivities are by forward mode: an adjoint for
+      reverse mode alone serves users who differentiate a run themselves.
     - `interpolation`: of the reference between samples, `"cubic"`, `"linear"` or `"hold"`.
+    - `max_steps`: largest number of adaptive steps, for each interval between samples on average.
     - `settled`: whether jaxid has chosen `substeps`, and may choose more; no setting of a user's.
+
+    **Raises:** `ModelError` for a solver or controller that cannot integrate a loop.
     """
 
     solver: diffrax.AbstractSolver = RK4()
@@ -81,67 +96,68 @@ class Stepping(eqx.Module):
     control: diffrax.AbstractStepSizeController | None = None
     adjoint: diffrax.AbstractAdjoint = diffrax.ForwardMode()
     interpolation: Literal["cubic", "linear", "hold"] = eqx.field(static=True, default="cubic")
+    max_steps: int = eqx.field(static=True, default=1000)
     settled: bool = eqx.field(static=True, default=False)
 
+    def __check_init__(self):
+        name = type(self.solver).__name__
+        if not _whole(self.solver):
+            raise ModelError(
+                f"{name} wants the equations in parts, which a loop does not have: choose another "
+                "solver, for instance diffrax.Tsit5() or diffrax.Kvaerno5()"
+            )
+        if self.substeps is not None and self.substeps < 1:
+            raise ModelError(f"substeps is {self.substeps}, but a sample takes one step at least")
+        if self.control is None:
+            return
+        if not isinstance(self.control, diffrax.AbstractAdaptiveStepSizeController):
+            raise ModelError(
+                f"{type(self.control).__name__} does not adapt its steps: give no control, and "
+                "Stepping(substeps=...) for the number of steps between two samples"
+            )
+        if not isinstance(self.solver, diffrax.AbstractAdaptiveSolver):
+            raise ModelError(
+                f"{name} estimates no error, which {type(self.control).__name__} needs: choose "
+                "another solver, or give no control for fixed steps"
+            )
 
-def flow(
-    stepping: Stepping,
-    field,
-    t0: Float[Array, ""],
-    h: Float[Array, ""],
-    x: PyTree[Float[Array, "..."]],
-    substeps: Int[Array, ""] | None = None,
-) -> PyTree[Float[Array, "..."]]:
-    """The state after an interval of `h` seconds; `field(t, x, args)` gives its rate.
+    @property
+    def plain(self) -> bool:
+        """Whether it is jaxid's own method with fixed steps, for which loops are written out."""
+        return isinstance(self.solver, RK4) and self.control is None
 
-    A padded interval has no length and leaves the state as it is. `substeps` takes the place of
-    the settings' own, for programs that serve any number; they have no reverse mode.
+
+def _whole(solver: diffrax.AbstractSolver) -> bool:
+    """Whether a solver takes the equations as one term."""
+    form: Any = solver.term_structure
+    return inspect.isclass(form) and issubclass(diffrax.ODETerm, form)
+
+
+def ready(stepping: Stepping) -> diffrax.AbstractSolver:
+    """The solver with all that diffrax would settle for one that stood alone in a solve.
+
+    An implicit one whose root finder has no tolerances takes them from the step-size controller.
+    For fixed steps there is none, and diffrax's own root finder is made for one: with tight
+    tolerances it takes rounding for divergence. So Newton's method takes its place.
     """
-    terms = diffrax.ODETerm(field)
-    if stepping.control is not None:
-        return _adaptive(stepping, terms, t0, h, x)
-    known = substeps is None
-    count = (stepping.substeps or 1) if substeps is None else substeps
-    solver, dt = stepping.solver, h / count
-    memory = solver.init(terms, t0, t0 + dt, x, None)
-
-    def substep(carry, k):
-        y, memory = carry
-        start = t0 + k * dt
-        y, _, _, memory, _ = solver.step(terms, start, start + dt, y, None, memory, False)
-        return (y, memory), None
-
-    if not known:
-        return jax.lax.fori_loop(0, count, lambda k, c: substep(c, k)[0], (x, memory))[0]
-    if stepping.substeps in (None, 1):
-        return substep((x, memory), 0)[0][0]
-    (x, _), _ = jax.lax.scan(substep, (x, memory), jnp.arange(stepping.substeps))
-    return x
+    solver: Any = stepping.solver
+    if isinstance(solver, diffrax.AbstractImplicitSolver):
+        names = [n for n in ("rtol", "atol", "norm") if not _is_set(solver.root_finder, n)]
+        if names and stepping.control is None:
+            newton = optimistix.Newton(rtol=1e-9, atol=1e-9)
+            solver = eqx.tree_at(lambda s: s.root_finder, solver, newton)
+        elif names:
+            given = [getattr(stepping.control, name) for name in names]
+            at = lambda s: [getattr(s.root_finder, name) for name in names]  # noqa: E731
+            solver = eqx.tree_at(at, solver, given)
+    if isinstance(solver, diffrax.AbstractRungeKutta) and solver.scan_kind is None:
+        # How its stages are looped over decides which derivatives go through them.
+        kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
+        kind = kinds.get(type(stepping.adjoint))
+        solver = eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
+    return solver
 
 
-def _adaptive(
-    stepping: Stepping,
-    terms: diffrax.ODETerm,
-    t0: Float[Array, ""],
-    h: Float[Array, ""],
-    x: Float[Array, " states"],
-) -> Float[Array, " states"]:
-    # A padded interval is solved over a token length, and its result is not used.
-    length = jnp.where(h > 0, h, 1e-6)
-    assert stepping.control is not None
-    solution = diffrax.diffeqsolve(
-        terms,
-        stepping.solver,
-        t0,
-        t0 + length,
-        length / (stepping.substeps or 1),
-        x,
-        stepsize_controller=stepping.control,
-        adjoint=stepping.adjoint,
-        saveat=diffrax.SaveAt(t1=True),
-        max_steps=4096,
-        throw=False,
-    )
-    assert solution.ys is not None
-    finished = jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys[-1], jnp.nan)
-    return jnp.where(h > 0, finished, x)
+def _is_set(finder: Any, name: str) -> bool:
+    value = getattr(finder, name)
+    return callable(value) or eqx.is_array_like(value)

@@ -7,8 +7,8 @@ processor handles eight of them.
 """
 
 import math
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -16,6 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from .decompositions import decomposed
+from .kernels import plain_product, say_what_splits, summed_product
+from .moves import MOVES
 
 # Arrays above these sizes are left whole: writing a spline's dozen knots out would only make
 # programs long. Matrices and what has more axes are a few joints' own, and their derivatives.
@@ -35,8 +39,12 @@ INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_c
 def unrolled(fun: Callable[..., Any], *like: Any) -> Callable[..., Any]:
     """The same function, traced once and evaluated scalar by scalar.
 
-    Operations that it does not know how to write out (loops, decompositions, functions with a
-    derivative of their own) and large arrays are evaluated as they are.
+    Operations that it does not know how to write out (loops, eigenvalues, functions with a
+    derivative of their own) and large arrays are evaluated as they are; a warning names what of
+    them XLA cannot compile as a part of a loop's kernel.
+
+    Values are those of `fun` under `jax.jit`, signed zeros, infinities and NaN among them, up to
+    rounding (sums may be added in another order) and the sign of sums of zeros alone.
 
     **Arguments:**
 
@@ -109,24 +117,70 @@ def _known(x) -> bool:
     return isinstance(x, np.generic)
 
 
-def _as_it_is(eqn, inputs: list[_Value]) -> list[_Value]:
-    """One equation evaluated with whole arrays."""
+def _same(name: str, args: list[Any]):
+    """The operand that an operation leaves as it is; None where it changes it.
+
+    −0 + 0 is 0 by IEEE 754, but XLA too leaves out the addition of a known zero of either sign.
+    """
+    if len(args) != 2:
+        return None
+    for a, known in (args, args[::-1]):
+        neutral = {"add": 0, "mul": 1, "sub": 0 if known is args[1] else None}.get(name)
+        if neutral is not None and _known(known) and known == neutral:
+            return a
+    return None
+
+
+def _as_it_is(eqn, inputs: list[_Value], origin) -> list[_Value]:
+    """One equation evaluated with whole arrays; it comes from the outermost one, `origin`."""
+    whole = [v.whole() for v in inputs]
+    out = summed_product(eqn, whole) or decomposed(eqn, whole)
+    if out is None:
+        say_what_splits(eqn, origin)
+        out = _bound(eqn, whole, origin)
+    shapes = [v.aval for v in eqn.outvars]
+    return [_Value(s.shape, s.dtype, array=o) for s, o in zip(shapes, out, strict=True)]
+
+
+def _bound(eqn, whole: list[Any], origin) -> Sequence[Any]:
+    """What the primitive itself makes of arrays."""
     given = eqn.primitive.get_bind_params(eqn.params)
     # Before jax 0.10 functions among the parameters came apart from the rest.
     functions, params = given if isinstance(given, tuple) else ((), given)
-    out = eqn.primitive.bind(*functions, *(v.whole() for v in inputs), **params)
-    out = out if eqn.primitive.multiple_results else [out]
-    shapes = [v.aval for v in eqn.outvars]
-    return [_Value(s.shape, s.dtype, array=o) for s, o in zip(shapes, out, strict=True)]
+    if eqn.primitive.name == "custom_linear_solve":
+        params = _with_solver_written_out(params, origin)
+    out = eqn.primitive.bind(*functions, *whole, **params)
+    return out if eqn.primitive.multiple_results else [out]
+
+
+def _with_solver_written_out(params: dict[str, Any], origin) -> dict[str, Any]:
+    """The parameters of a linear solve, its derivative still that of a solve.
+
+    Only reverse mode needs the transposed ones.
+    """
+
+    def written(closed: ClosedJaxpr) -> ClosedJaxpr:
+        def evaluate(*args):
+            consts = [_Value.of(c) for c in closed.consts]
+            found = _Writer(origin).run(closed.jaxpr, consts, [_Value.of(a) for a in args])
+            return [value.whole() for value in found]
+
+        return jax.make_jaxpr(evaluate)(*closed.in_avals)
+
+    jaxprs = params["jaxprs"]
+    jaxprs = jaxprs._replace(matvec=written(jaxprs.matvec), solve=written(jaxprs.solve))
+    return {**params, "jaxprs": jaxprs}
 
 
 class _Writer:
     """Evaluates a jaxpr, each scalar expression once."""
 
-    def __init__(self):
+    def __init__(self, origin=None):
         self.seen: dict[Any, Any] = {}
         # Keys hold identities, so what they name must live as long as they do.
         self.alive: list[Any] = []
+        # The equation that is being evaluated, the outermost if one is a part of another.
+        self.origin = origin
 
     def run(self, jaxpr: Jaxpr, consts: list[_Value], args: list[_Value]) -> list[_Value]:
         values: dict[Any, _Value] = {}
@@ -149,7 +203,7 @@ class _Writer:
         if name in INLINED:
             inner = eqn.params[INLINED[name]]
             if isinstance(inner, ClosedJaxpr):
-                return self.run(inner.jaxpr, [_Value.of(c) for c in inner.consts], inputs)
+                return self.inlined(eqn, inner, inputs)
         shapes = [v.aval for v in eqn.outvars]
         moved = name in MOVES and all(v.written_out for v in inputs)
         if moved or all(v.small for v in [*inputs, *map(_Value.like, shapes)]):
@@ -160,7 +214,14 @@ class _Writer:
                     _Value(s.shape, s.dtype, scalars=w.reshape(s.shape))
                     for s, w in zip(shapes, pieces, strict=True)
                 ]
-        return _as_it_is(eqn, inputs)
+        return _as_it_is(eqn, inputs, self.origin or eqn)
+
+    def inlined(self, eqn, inner: ClosedJaxpr, inputs: list[_Value]) -> list[_Value]:
+        """A function that was traced as a part, in the place of its call."""
+        before, self.origin = self.origin, self.origin or eqn
+        found = self.run(inner.jaxpr, [_Value.of(c) for c in inner.consts], inputs)
+        self.origin = before
+        return found
 
     def written(self, eqn, name: str, inputs: list[_Value]):
         """The scalars of what an equation gives; None where it cannot be written out."""
@@ -198,19 +259,21 @@ class _Writer:
         """One scalar operation, or what it gave before."""
         if all(_known(a) for a in args):
             if name in ARITHMETIC:
-                return ARITHMETIC[name](*args)
-            if name == "convert_element_type":
+                with np.errstate(all="ignore"):
+                    return ARITHMETIC[name](*args)
+            # What becomes of numbers that an integer type lacks is XLA's to say.
+            if name == "convert_element_type" and not (
+                args[0].dtype.kind == "f" and np.dtype(params["new_dtype"]).kind in "iu"
+            ):
                 return np.asarray(args[0], params["new_dtype"])[()]
-        if name == "add" and _known(args[0]) and args[0] == 0:
-            return args[1]
-        if name in ("add", "sub") and _known(args[1]) and args[1] == 0:
-            return args[0]
-        if name == "mul" and any(_known(a) and a == 1 for a in args):
-            return args[1] if _known(args[0]) and args[0] == 1 else args[0]
+        same = _same(name, args)
+        if same is not None:
+            return same
         key = (
             name,
             tuple(sorted((k, str(v)) for k, v in params.items() if v is not None)),
-            tuple((a.dtype, a.item()) if _known(a) else id(a) for a in args),
+            # By their bits: −0 and 0 are equal, and divide differently.
+            tuple((a.dtype, a.tobytes()) if _known(a) else id(a) for a in args),
         )
         if key not in self.seen:
             self.alive.extend(args)
@@ -223,23 +286,39 @@ class _Writer:
     def plus(self, a, b):
         return self.once("add", {}, [a, b], jax.lax.add)
 
+    def added(self, terms: list[Any], dtype):
+        """The sum of zero and some terms, from the first to the last."""
+        return reduce(self.plus, terms, np.zeros((), dtype)[()])
+
+    def converted(self, value: _Value, dtype) -> np.ndarray:
+        """The scalars of a value in another type."""
+        if value.dtype == dtype:
+            return value.scalars()
+        params = {"new_dtype": dtype, "weak_type": False}
+        evaluate = partial(jax.lax.convert_element_type, new_dtype=dtype)
+        out = np.empty(value.shape, object)
+        for at in np.ndindex(value.shape):
+            out[at] = self.once("convert_element_type", params, [value.scalars()[at]], evaluate)
+        return out
+
     def product(self, p, left: _Value, right: _Value):
         (contract_left, contract_right), (batch_left, batch_right) = p["dimension_numbers"]
-        if left.dtype != right.dtype:
+        wanted = np.dtype(p["preferred_element_type"] or left.dtype)
+        if left.dtype != right.dtype or not plain_product(p, left.dtype):
             return None
         batch, shared = len(batch_left), len(contract_left)
         first = (*batch_left, *contract_left), (*batch_right, *contract_right)
-        a = np.moveaxis(left.scalars(), first[0], range(batch + shared))
-        b = np.moveaxis(right.scalars(), first[1], range(batch + shared))
+        a, b = self.converted(left, wanted), self.converted(right, wanted)
+        a = np.moveaxis(a, first[0], range(batch + shared))
+        b = np.moveaxis(b, first[1], range(batch + shared))
         several, depth = a.shape[:batch], math.prod(a.shape[batch : batch + shared])
         rows, columns = a.shape[batch + shared :], b.shape[batch + shared :]
         a = a.reshape(math.prod(several), depth, math.prod(rows))
         b = b.reshape(math.prod(several), depth, math.prod(columns))
         out = np.empty((a.shape[0], a.shape[2], b.shape[2]), object)
         for n, i, j in np.ndindex(out.shape):
-            out[n, i, j] = np.zeros((), left.dtype)[()]
-            for k in range(depth):
-                out[n, i, j] = self.plus(out[n, i, j], self.times(a[n, k, i], b[n, k, j]))
+            terms = [self.times(a[n, k, i], b[n, k, j]) for k in range(depth)]
+            out[n, i, j] = self.added(terms, wanted)
         return out.reshape(several + rows + columns)
 
     def running(self, p, value: _Value):
@@ -255,10 +334,10 @@ class _Writer:
         axes = tuple(p["axes"])
         moved = np.moveaxis(array, axes, range(len(axes)))
         kept = moved.shape[len(axes) :]
-        out = np.full(kept, np.zeros((), value.dtype)[()], object)
-        for at in np.ndindex(moved.shape[: len(axes)]):
-            for to in np.ndindex(kept):
-                out[to] = self.plus(out[to], moved[at + to])
+        out = np.empty(kept, object)
+        for to in np.ndindex(kept):
+            terms = [moved[at + to] for at in np.ndindex(moved.shape[: len(axes)])]
+            out[to] = self.added(terms, value.dtype)
         return out
 
     def scattered(self, name, p, operand: _Value, indices: _Value, updates: _Value):
@@ -280,41 +359,6 @@ class _Writer:
         return out
 
 
-def _broadcast(p, x):
-    shape, where = p["shape"], p["broadcast_dimensions"]
-    spread = [1] * len(shape)
-    for d, n in zip(where, x.shape, strict=True):
-        spread[d] = n
-    return np.broadcast_to(x.reshape(spread), shape)
-
-
-def _slice(p, x):
-    strides = p["strides"] or (1,) * x.ndim
-    return x[
-        tuple(
-            slice(a, b, s)
-            for a, b, s in zip(p["start_indices"], p["limit_indices"], strides, strict=True)
-        )
-    ]
-
-
-def _split(p, x):
-    return np.split(x, np.cumsum(p["sizes"])[:-1], axis=p["axis"])
-
-
-MOVES: dict[str, Callable[..., Any]] = {
-    "broadcast_in_dim": _broadcast,
-    "reshape": lambda p, x: x.reshape(p["new_sizes"]),
-    "squeeze": lambda p, x: np.squeeze(x, p["dimensions"]),
-    "expand_dims": lambda p, x: np.expand_dims(x, p["dimensions"]),
-    "transpose": lambda p, x: np.transpose(x, p["permutation"]),
-    "rev": lambda p, x: np.flip(x, p["dimensions"]),
-    "slice": _slice,
-    "split": _split,
-    "concatenate": lambda p, *xs: np.concatenate(xs, axis=p["dimension"]),
-    "stack": lambda p, *xs: np.stack(xs, axis=p["axis"]),
-    "unstack": lambda p, x: list(np.moveaxis(x, p["axis"], 0)),
-}
 # What is worth knowing already when a program is written: indices, and zeros.
 ARITHMETIC: dict[str, Callable[..., Any]] = {
     "add": lambda a, b: a + b,

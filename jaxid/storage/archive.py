@@ -12,29 +12,29 @@ import importlib.metadata
 import io
 import json
 import math
-import types
-import typing
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 
 from ..errors import SaveError, sentence
+from .arrays import npy
+from .classes import Registry, agrees, hints, origin, rebuilt
 
-# Raised whenever an older jaxid could not read what this one writes; older formats stay readable.
-FORMAT = 1
+if TYPE_CHECKING:
+    import pandas as pd
+
+# Raised whenever an older jaxid could not read what this one writes; older formats stay readable: a
+# class whose fields meant something else has a method `of_format(format)` that gives the object of
+# now. 2: what a loop holds or frees is kept by place, no longer by name.
+FORMAT = 2
 
 # Everything but arrays; a story of many steps has about one megabyte.
 _LARGEST_MANIFEST = 256 * 2**20
 _PACKAGES = ("jaxid-robotics", "jax", "jaxlib", "equinox", "diffrax", "numpy", "scipy")
-
-# A class by the package it comes from ("" for jaxid itself) and its name.
-Registry = Mapping[tuple[str, str], type]
 
 
 def versions() -> dict[str, str]:
@@ -46,39 +46,6 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             found[package] = "not installed"
     return found
-
-
-def origin(cls: type) -> tuple[str, str]:
-    """How a class is called in a file: its package and name; a user's own, its module and name."""
-    package = cls.__module__.partition(".")[0]
-    where = {"jaxid": "", "diffrax": "diffrax"}.get(package, cls.__module__)
-    return where, cls.__name__
-
-
-def registered(classes: Iterable[type]) -> dict[tuple[str, str], type]:
-    """Classes by the names they have in files."""
-    return {origin(cls): cls for cls in classes}
-
-
-def classes_of(tree: Any) -> set[type]:
-    """The classes of all modules in a tree: what restoring it takes."""
-    found: set[type] = set()
-    waiting = [tree]
-    while waiting:
-        value = waiting.pop()
-        if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            found.add(type(value))
-            waiting += [getattr(value, field.name) for field in dataclasses.fields(value)]
-        elif isinstance(value, dict):
-            waiting += value.values()
-        elif isinstance(value, (tuple, list)):
-            waiting += value
-        elif isinstance(value, enum.Enum):
-            found.add(type(value))
-    return found
-
-
-# --- writing ------------------------------------------------------------------------------------
 
 
 def pack(value: Any) -> bytes:
@@ -119,6 +86,8 @@ class _Packer:
 
     def node(self, value: Any, where: str) -> Any:
         """The JSON of a value; `where` names it in a complaint."""
+        import pandas as pd
+
         match value:
             case enum.Enum():
                 package, name = origin(type(value))
@@ -182,7 +151,7 @@ class _Packer:
         self.arrays.append((_digest(content), content))
         return {"array": len(self.arrays) - 1, "jax": isinstance(value, jax.Array)}
 
-    def _frame(self, frame: pd.DataFrame, where: str) -> Any:
+    def _frame(self, frame: "pd.DataFrame", where: str) -> Any:
         levels = [frame.index.get_level_values(k) for k in range(frame.index.nlevels)]
         return {
             "frame": self._array(frame.to_numpy(np.float64), where),
@@ -194,9 +163,6 @@ class _Packer:
 
 def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
-
-
-# --- reading ------------------------------------------------------------------------------------
 
 
 def unpack(content: bytes, source: str, registry: Registry) -> Any:
@@ -232,6 +198,7 @@ class _Unpacker:
         self.arrays: list[np.ndarray] = []
         self.objects: list[Any] = []
         self._device: dict[int, jax.Array] = {}
+        self.format = FORMAT
 
     def read(self, content: bytes) -> Any:
         members = self._members(content)
@@ -285,6 +252,7 @@ class _Unpacker:
                 f"is of format {written} (jaxid {by}), and this jaxid reads formats up to {FORMAT}",
                 "upgrade jaxid",
             )
+        self.format = written
 
     def _damaged(self, what: str) -> SaveError:
         return _complaint(self.source, f"is damaged: {what}", "save or copy it again")
@@ -328,8 +296,10 @@ class _Unpacker:
                     f"holds {cls.__name__} with a field {name}, which it does not have here",
                     "load it with the version that wrote it",
                 )
-        made = _rebuild(cls, given)
-        for name, hint in _hints(cls).items():
+        made = rebuilt(cls, given)
+        if self.format < FORMAT and hasattr(cls, "of_format"):
+            made = made.of_format(self.format)
+        for name, hint in hints(cls).items():
             if name in fields and not agrees(getattr(made, name), hint):
                 raise self._damaged(f"{cls.__name__}.{name} is not what it should be")
         return made
@@ -367,99 +337,11 @@ class _Unpacker:
             self._device[k] = jnp.asarray(self.arrays[k])
         return self._device[k]
 
-    def _frame(self, frame: Any, columns: Any, index: Any, names: Any) -> pd.DataFrame:
+    def _frame(self, frame: Any, columns: Any, index: Any, names: Any) -> "pd.DataFrame":
+        import pandas as pd
+
         if len(index) == 1:
             labels = pd.Index(index[0], name=names[0])
         else:
             labels = pd.MultiIndex.from_arrays(index, names=names)
         return pd.DataFrame(self.value(frame), index=labels, columns=columns)
-
-
-def npy(content: bytes) -> np.ndarray:
-    """The array in the bytes of a `.npy`, whose header must tell the truth about their number.
-
-    `numpy.load` sets aside whatever a header asks for before it reads.
-
-    **Raises:** `ValueError` where it does not, or for Python objects.
-    """
-    stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
-    header = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
-    if version not in header:
-        raise ValueError(f"version {version} of .npy is not supported")
-    shape, fortran, dtype = header[version](stream)
-    if dtype.hasobject:
-        raise ValueError("it holds Python objects, which are refused")
-    size, there = math.prod(shape) * dtype.itemsize, len(content) - stream.tell()
-    if any(n < 0 for n in shape) or size != there:
-        raise ValueError(f"its header promises {size} bytes of data and {there} are there")
-    values = np.frombuffer(content, dtype, count=math.prod(shape), offset=stream.tell())
-    shaped = values.reshape(shape[::-1]).T if fortran else values.reshape(shape)
-    return shaped.copy()
-
-
-def _rebuild(cls: type, given: Mapping[str, Any]) -> Any:
-    """An object of its fields as they were, past converters and with the checks that follow them.
-
-    A field that the file does not know, for it is older, has its default.
-    """
-    made = object.__new__(cls)
-    for field in dataclasses.fields(cls):
-        if field.name in given:
-            value = _or_default(given[field.name], field.default)
-        elif field.default is not dataclasses.MISSING:
-            value = field.metadata.get("converter", lambda x: x)(field.default)
-        elif field.default_factory is not dataclasses.MISSING:
-            value = field.default_factory()
-        else:
-            raise ValueError(f"{cls.__name__} needs a value for {field.name}")
-        object.__setattr__(made, field.name, value)
-    for base in cls.__mro__:
-        if "__check_init__" in vars(base):
-            base.__check_init__(made)  # type: ignore[attr-defined]
-    return made
-
-
-def _or_default(value: Any, default: Any) -> Any:
-    """The default itself where the value is the same: equinox prints a field that `is` not it."""
-    if type(value) is not type(default):
-        return value
-    if isinstance(value, (str, int, float)):
-        return default if repr(value) == repr(default) else value
-    same = isinstance(value, eqx.Module) and eqx.tree_equal(value, default) is True
-    return default if same else value
-
-
-def _hints(cls: type) -> dict[str, Any]:
-    try:
-        return typing.get_type_hints(cls)
-    except Exception:  # annotations of a user's class may name what only a type checker sees
-        return {}
-
-
-def agrees(value: Any, hint: Any) -> bool:
-    """Whether a value may stand in a field with that annotation; what is not known may."""
-    if hint in (Any, None) or isinstance(hint, (str, typing.TypeVar)):
-        return hint is not None or value is None
-    made_of, of = typing.get_origin(hint), typing.get_args(hint)
-    if made_of in (typing.Union, types.UnionType):
-        return any(agrees(value, one) for one in of)
-    if made_of is typing.Literal:
-        return value in of
-    if made_of is tuple:
-        if not isinstance(value, tuple):
-            return False
-        if len(of) == 2 and of[1] is Ellipsis:
-            return all(agrees(one, of[0]) for one in value)
-        return len(of) == len(value) and all(map(agrees, value, of))
-    plain = made_of or hint
-    if plain in (int, float) or hasattr(plain, "array_type"):
-        # A number of a module becomes an array, and an array one of more axes, under `vmap`.
-        numbers = (int, float, np.ndarray, jax.Array)
-        return isinstance(value, numbers) and not isinstance(value, bool)
-    if isinstance(plain, type):
-        return isinstance(value, plain)
-    return True

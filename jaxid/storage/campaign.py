@@ -21,6 +21,7 @@ import numpy as np
 
 from ..errors import JaxidError, SaveError, sentence
 from . import archive
+from .classes import classes_of
 from .files import write_whole
 from .saved import registry
 
@@ -172,7 +173,7 @@ class Campaign:
 
     def _keep(self, name: str, value: Any) -> Any:
         # What a catalogue's own functions made can be read back by whoever has made it once.
-        self._classes |= archive.classes_of(value)
+        self._classes |= classes_of(value)
         if self.folder is not None and not isinstance(value, _Died):
             content = archive.pack({"piece": name, "plan": self._key, "value": value})
             write_whole(self.path(name), content)

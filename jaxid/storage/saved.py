@@ -1,6 +1,7 @@
 """Saved results read back: `jaxid.load`."""
 
 import enum
+import importlib
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,6 +12,7 @@ import equinox as eqx
 
 from ..errors import SaveError, sentence
 from . import archive
+from .classes import registered
 from .files import write_whole
 
 # Larger than any story of a day's recordings, and small enough to be read on a laptop.
@@ -76,11 +78,14 @@ def load(
 
 def registry(classes: Iterable[type] = ()) -> dict[tuple[str, str], type]:
     """The classes that a file may hold: jaxid's own, diffrax's steps, and those given."""
+    # `import jaxid` leaves these rooms for later, and only what was imported is found below.
+    for room in ("discovery", "excitation"):
+        importlib.import_module(f"jaxid.{room}")
     loaded = _below(eqx.Module) | _below(enum.Enum)
     ours = {c for c in loaded if c.__module__.startswith("jaxid.")}
     bases = (diffrax.AbstractSolver, diffrax.AbstractStepSizeController, diffrax.AbstractAdjoint)
     theirs = {c for c in vars(diffrax).values() if isinstance(c, type) and issubclass(c, bases)}
-    return archive.registered([*ours, *theirs, *classes])
+    return registered([*ours, *theirs, *classes])
 
 
 def _below(cls: type) -> set[type]:

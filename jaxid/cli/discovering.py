@@ -1,0 +1,206 @@
+"""The commands `discover` and `demo`."""
+
+import itertools
+import shutil
+import tempfile
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from ..errors import RecordingError
+from .ending import sentences
+from .files import check_outputs, read_files, write_json
+from .models import load_effect, load_robot, with_controller
+from .options import Catalogue, Column, Controller, Files, Json, Quiet, Report, Robot, Unit
+from .showing import LEGEND, error_falls, say, tell
+
+
+class Spread(TyperCommand):
+    """A command in which `--validate` takes every file up to the next option.
+
+    Only after the files to fit: in `--validate a.csv b.csv` with none before, the second is one
+    of those.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Writes `--validate` before each of its files, which is how one option takes several."""
+        valued = {name for p in self.params for name in p.opts if not getattr(p, "is_flag", True)}
+        return super().parse_args(ctx, spread(args, "--validate", valued))
+
+
+def spread(args: list[str], option: str, valued: set[str]) -> list[str]:
+    """Arguments in which an option that was given several values is repeated for each.
+
+    **Arguments:**
+
+    - `option`: the one that may take several.
+    - `valued`: options that take one value.
+    """
+    out: list[str] = []
+    fitted = taking = False
+    rest = iter(args)
+    for word in rest:
+        if word == "--":
+            return [*out, word, *rest]
+        if word.startswith("-") and word != "-":
+            name, equals, _ = word.partition("=")
+            taking = name == option and fitted
+            out.append(word)
+            if name in valued and not equals:
+                out.extend(value for value in [next(rest, None)] if value is not None)
+        elif taking:
+            out += [option, word]
+        else:
+            fitted = True
+            out.append(word)
+    return out
+
+
+def discover(
+    files: Files,
+    validate: Annotated[
+        list[Path] | None,
+        typer.Option(help="Recordings held out of the fit, to judge by: one or several."),
+    ] = None,
+    robot: Robot = "scara",
+    json_file: Json = None,
+    report: Report = None,
+    resume: Annotated[
+        Path | None, typer.Option(help="Save each step in this folder, and go on from there.")
+    ] = None,
+    save: Annotated[
+        Path | None,
+        typer.Option(help="Write story and model to this file (story.jaxid), for compare --fit."),
+    ] = None,
+    catalogue: Catalogue = None,
+    column: Column = None,
+    unit: Unit = None,
+    controller: Controller = None,
+    quiet: Quiet = False,
+) -> None:
+    """Find the physical effect that the model lacks, and add it.
+
+    The exit code is 0 whatever the verdict, 2 where something given cannot be used. Ctrl-C keeps
+    the steps so far in the folder of --resume, or else in jaxid-steps, and says how to go on.
+
+    \b
+    Examples:
+      jaxid discover fit_1.csv fit_2.csv --validate held_out.csv
+      jaxid discover run_*.csv --validate held_1.csv held_2.csv --robot my_robot.py:loop \\
+            --unit q=deg --json story.json --report story.html --resume steps
+      jaxid discover run_*.csv --catalogue my_effects.py:Hose --save story.jaxid
+    """
+    from ..discovery import discover as run_discover
+    from ..effects import catalogue as known
+    from ..report import write_report
+
+    journal = _Kept(resume)
+    # The folder outlives the interrupt, whose farewell takes the steps out of it.
+    with journal, sentences(journal.farewell):
+        check_outputs(json_file, report, save)
+        loop = with_controller(load_robot(robot), controller)
+        own = [load_effect(given) for given in catalogue or ()]
+        held_out = list(validate or [])
+        _check_apart(files, held_out)
+        story = run_discover(
+            loop,
+            read_files(files, column, unit),
+            validate=read_files(held_out, column, unit) if held_out else None,
+            catalogue=(*known, *own),
+            resume=journal.path,
+            progress=not quiet,
+        )
+        tell(story, quiet)
+        write_json(json_file, story.to_dict())
+        if save is not None:
+            story.save(save)
+        if report is not None:
+            write_report(story, report)
+
+
+class _Kept:
+    """Where the steps of a discovery are saved: the user's folder, or one an interrupt keeps."""
+
+    def __init__(self, resume: Path | None) -> None:
+        self.own = Path(tempfile.mkdtemp(prefix="jaxid-")) if resume is None else None
+        self.path = resume or Path(str(self.own)) / "steps"
+
+    def __enter__(self) -> "_Kept":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.own is not None:
+            # What an interrupt wants kept has been moved out of here by its farewell.
+            shutil.rmtree(self.own, ignore_errors=True)
+
+    def farewell(self) -> str:
+        """What is said after an interrupt: what was done, and how to go on from there."""
+        done = len(list(self.path.glob("*.piece")))
+        if not done:
+            return " before the first step was done; nothing is saved"
+        path = self.path
+        if self.own is not None:
+            path = next(p for p in _names("jaxid-steps") if not p.exists())
+            shutil.move(self.path, path)
+        said = f" with {done} step{'s' if done > 1 else ''} done"
+        return f"{said}; the same command with --resume {path} goes on from there"
+
+
+def _names(name: str) -> Iterator[Path]:
+    """The name, then the same with a number."""
+    path = Path(name)
+    yield path
+    for k in itertools.count(2):
+        yield path.with_stem(f"{path.stem}-{k}")
+
+
+def _check_apart(files: list[Path], held_out: list[Path]) -> None:
+    both = {path.resolve() for path in files} & {path.resolve() for path in held_out}
+    if both:
+        raise RecordingError(
+            f"{min(both).name} is both to be fitted and held out: what judges a model must not "
+            "have made it"
+        )
+
+
+def demo(
+    report: Report = None,
+    quiet: Quiet = False,
+) -> None:
+    """The story on bundled recordings: a model that suffices, and one that lacks an effect.
+
+    Takes about a minute, most of it to compile. With --report, the second story as a page.
+
+    \b
+    Example:
+      jaxid demo --report story.html
+    """
+    from ..discovery import discover as run_discover
+    from ..recording import read
+    from ..report import write_report
+
+    with sentences():
+        check_outputs(report)
+        for kind, says in (
+            ("clean", "1. Recordings of a SCARA that the model describes"),
+            ("hidden", "2. The same arm with a physical effect that the model lacks"),
+        ):
+            with resources.as_file(resources.files("jaxid") / "demo" / kind) as path:
+                used = read(path / "fit_1.csv", path / "fit_2.csv")
+                unseen = read(path / "held_out.csv")
+            say(f"\n{says}", bold=True)
+            story = run_discover(load_robot("scara"), used, validate=unseen, progress=not quiet)
+            tell(story, quiet)
+            if not quiet:
+                error_falls(story)
+        if not quiet:
+            typer.echo(LEGEND)
+        if report is not None:
+            write_report(story, report)
+        if not quiet:
+            typer.echo("\nThe same as a page with figures: jaxid demo --report story.html")
+            typer.echo("On your own recordings: jaxid discover --help")

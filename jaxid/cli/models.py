@@ -1,0 +1,117 @@
+"""Models that a command is given by name, by file, or as what another command wrote."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from ..errors import ModelError
+
+
+def load_robot(robot: str) -> Any:
+    """A loop by the name of a ready robot, or from a Python file.
+
+    **Arguments:**
+
+    - `robot`: `scara`, `two-link`, `emps`, or `path/to/file.py:name` of a loop, or of a function
+      without arguments that gives one.
+
+    **Raises:** `ModelError` that says what was not found.
+    """
+    from .. import robots
+    from ..simulation.loop import ClosedLoop
+
+    ready = {"scara": robots.scara, "two-link": robots.two_link, "emps": robots.emps}
+    if robot in ready:
+        return ready[robot]()
+    path, _, name = robot.rpartition(":")
+    if not path.endswith(".py"):
+        raise ModelError(
+            f"there is no robot {robot!r}: choose {', '.join(ready)}, or give FILE.py:NAME"
+        )
+    made = getattr(_module(path), name, None)
+    try:
+        made = made() if callable(made) and not isinstance(made, ClosedLoop) else made
+    except Exception as error:
+        raise ModelError(
+            f"{name}() in {path} fails ({error!r}): give a function without arguments that "
+            "returns a ClosedLoop"
+        ) from error
+    if not isinstance(made, ClosedLoop):
+        raise ModelError(f"{path} has no ClosedLoop called {name!r}: name the one it defines")
+    return made
+
+
+def load_effect(given: str) -> Any:
+    """An effect's class from a Python file, or whatever else a catalogue may hold.
+
+    **Arguments:**
+
+    - `given`: `path/to/file.py:Name`.
+
+    **Raises:** `ModelError` that says what was not found.
+    """
+    path, _, name = given.rpartition(":")
+    if not path.endswith(".py"):
+        raise ModelError(f"--catalogue {given!r} names no effect: give FILE.py:NAME of its class")
+    module = _module(path)
+    if not hasattr(module, name):
+        raise ModelError(f"{path} has no effect called {name!r}: name the class it defines")
+    return getattr(module, name)
+
+
+def _module(path: str) -> Any:
+    """A user's Python file, imported."""
+    if not Path(path).is_file():
+        raise ModelError(f"there is no file {path}: give the path of your own Python file")
+    known = sys.modules.get(Path(path).stem)
+    if known is not None and getattr(known, "__file__", None) == path:
+        return known
+    spec = importlib.util.spec_from_file_location(Path(path).stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.path.insert(0, str(Path(path).resolve().parent))
+    # Annotations that are strings are looked up in the module that they were written in.
+    sys.modules.setdefault(spec.name, module)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise ModelError(f"{path} fails when it is imported ({error!r}): mend it first") from error
+    return module
+
+
+def with_controller(loop: Any, controller: str | None) -> Any:
+    """The loop under the law that `--controller` names; its own where it names none."""
+    import dataclasses
+
+    from ..control import OpenLoop, Tracking
+
+    if controller is None:
+        return loop
+    laws = {"tracking": Tracking, "open-loop": OpenLoop}
+    if controller not in laws:
+        raise ModelError(f"there is no controller {controller!r}: choose {', '.join(laws)}")
+    return dataclasses.replace(loop, controller=laws[controller]())
+
+
+def with_fitted(loop: Any, path: Path, own: frozenset[type] = frozenset()) -> Any:
+    """The loop at the values, or instead of it the model, that an earlier command wrote."""
+    if path.suffix == ".jaxid":
+        from ..storage.classes import classes_of
+        from ..storage.saved import load
+
+        saved = load(path, classes_of(loop) | own)
+        if not hasattr(saved, "loop"):
+            raise ModelError(f"{path} holds no model: give a saved fit or story")
+        return saved.loop
+    try:
+        parameters = json.loads(path.read_text(encoding="utf-8"))["parameters"]
+        found = {name: float(entry["value"]) for name, entry in parameters.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ModelError(
+            f"{path} holds no fitted parameters ({error!r}): give a file that "
+            "`jaxid fit --json` or `jaxid discover --save` wrote"
+        ) from error
+    return loop.with_values(**found)

@@ -1,0 +1,40 @@
+"""Options that several commands have."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Files = Annotated[
+    list[Path],
+    typer.Argument(help="Recordings: .csv, .tsv, .txt, .parquet, .mat or .npz, also .gz."),
+]
+Robot = Annotated[
+    str, typer.Option(help="scara, two-link, emps, or FILE.py:NAME for a loop of your own.")
+]
+Json = Annotated[Path | None, typer.Option("--json", help="Also write the result here.")]
+Column = Annotated[
+    list[str] | None,
+    typer.Option("--column", help="Our name=theirs, as q=pos_1,pos_2; once for each signal."),
+]
+Unit = Annotated[
+    list[str] | None, typer.Option("--unit", help="Unit of a signal that is not SI, as q=deg.")
+]
+METHODS = "oem, pem, idim, idim-iv, didim, integral, filtered, fourier or difference."
+Controller = Annotated[
+    str | None,
+    typer.Option(help="tracking (the real law is unknown) or open-loop (recorded torque)."),
+]
+Window = Annotated[
+    float | None, typer.Option(help="Simulate pieces of this length on their own, s.")
+]
+Report = Annotated[
+    Path | None, typer.Option(help="Write the story to this HTML file, which needs no network.")
+]
+Catalogue = Annotated[
+    list[str] | None,
+    typer.Option(help="FILE.py:NAME of an effect of your own, asked beside the known ones."),
+]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="No progress, and the result in a line.")
+]

@@ -1,0 +1,49 @@
+"""What commands print beside a result's own text."""
+
+import os
+import sys
+from typing import Any
+
+import typer
+
+
+def say(text: str, **style: Any) -> None:
+    """Prints a line, in colour where the terminal has it and the user wants it."""
+    plain = "NO_COLOR" in os.environ or not sys.stdout.isatty()
+    typer.echo(text if plain else typer.style(text, **style))
+
+
+def pooled(result: Any) -> dict[str, float]:
+    """Relative error of each joint over all recordings together, %."""
+    return ((result.error_percent**2).mean() ** 0.5).to_dict()
+
+
+def tell(story: Any, quiet: bool = False) -> None:
+    """Prints a discovery: its verdict, and all of it where that is wanted."""
+    verdict, _, rest = repr(story).partition("\n")
+    colour = "yellow" if story.verdict == "outside_catalogue" else "green"
+    say(verdict, bold=True, fg=colour)
+    if not quiet:
+        typer.echo(rest)
+
+
+LEGEND = """
+relative error: norm of measured less simulated torque, over norm of measured torque
+fit, held out:  recordings that were fitted, and one that no fit has seen
+noise floor:    the error that a perfect model would leave
+±:              one standard deviation"""
+
+
+def error_falls(story: Any) -> None:
+    """A bar a step: held-out error of the joint at which the starting model did worst."""
+    table = story.table()
+    if len(table) < 2:
+        return
+    held = table[[name for name in table.columns if name.startswith("held out")]]
+    worst = str(held.iloc[0].idxmax())
+    error = held[worst]
+    typer.echo(f"\nerror on the recording that no fit saw ({worst.removeprefix('held out, ')}):")
+    width = max(len(str(step)) for step in error.index)
+    for step, value in error.items():
+        bar = "█" * max(1, round(30 * value / error.max()))
+        typer.echo(f"  {step!s:<{width}}  {bar} {value:.2f} %")

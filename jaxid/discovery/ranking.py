@@ -1,0 +1,136 @@
+"""Hypotheses ranked by what their signatures explain of the whitened residual."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..effects import Curve, Motion, Scene
+from ..estimate import Fit
+from .comparison import Comparison
+from .diagnosis import Diagnosis, Verdict, share_left
+from .hypotheses import Hypothesis
+from .score import Data, Gram, chance, corrected, effective_tests
+from .separate import columns_of, estimate_noise, leftover
+
+# Rows from which noise is told from physics as well as from all: a minute of two joints at 400 Hz.
+_ENOUGH = 50_000
+
+
+def judge(
+    fit: Fit | Comparison,
+    data: Data,
+    hypotheses: list[Hypothesis],
+    scene: Scene,
+    motion: Motion,
+    significance: float,
+) -> Diagnosis:
+    blocks = [h.columns for h in hypotheses]
+    windows = len(data.residual) != len(fit.recordings)
+    apart = estimate_noise(data.middle(_ENOUGH), blocks, alike=windows)
+    data, noise = dataclasses.replace(data, level=apart.data.level), apart.noise
+    gram = Gram.of(data, noise)
+    tests = effective_tests(gram, blocks)
+    ranking: dict[tuple[Any, ...], Verdict] = {}
+    forms: dict[tuple[Any, ...], Verdict] = {}
+    where: dict[tuple[Any, ...], Verdict] = {}
+    for hypothesis, explained, freedom in zip(hypotheses, *gram.explained(blocks), strict=True):
+        verdict = _verdict(gram, hypothesis, float(explained), int(freedom), tests)
+        effect = hypothesis.effect
+        if isinstance(effect, Curve):
+            where[(effect.label, effect.joint, effect.signed)] = verdict
+            continue
+        _keep_better(ranking, verdict.key, verdict)
+        _keep_better(forms, (*verdict.key, type(effect)), verdict)
+    columns = columns_of(blocks, apart.chosen)
+    best = tuple(sorted(ranking.values(), key=_order, reverse=True))
+    curves = tuple(sorted(where.values(), key=_order, reverse=True))
+    return Diagnosis(
+        fit=fit,
+        ranking=best,
+        forms=tuple(sorted(forms.values(), key=_order, reverse=True)),
+        where=curves,
+        pair=_pair(gram, hypotheses, best, curves, tests),
+        noise=noise,
+        data=data,
+        gram=gram,
+        scene=scene,
+        motion=motion,
+        floor=_floor(fit, data, leftover(data, noise, columns), len(columns)),
+        tests=tests,
+        significance=significance,
+    )
+
+
+def _pair(
+    gram: Gram,
+    hypotheses: list[Hypothesis],
+    ranking: tuple[Verdict, ...],
+    where: tuple[Verdict, ...],
+    tests: float,
+) -> tuple[Verdict, ...]:
+    """Two effects that only together explain what the best curve does, each leading entry tried."""
+    if not where or not ranking or where[0].evidence < ranking[0].evidence:
+        return ()
+    effects = [h for h in hypotheses if not isinstance(h.effect, Curve)]
+    best, most = (), where[0].evidence
+    for first in ranking[:8]:
+        rest = gram.without(first.hypothesis.columns)
+        explained, freedom = rest.explained([h.columns for h in effects])
+        own = [h.name == first.key[0] and h.joint == first.key[1] for h in effects]
+        evidence = np.where(own, -np.inf, explained - freedom * np.log(gram.count))
+        k = int(np.argmax(evidence))
+        if first.evidence + evidence[k] > most:
+            most = first.evidence + evidence[k]
+            value, count = gram.explained([effects[k].columns])
+            second = _verdict(gram, effects[k], float(value[0]), int(count[0]), tests)
+            best = (first, second)
+    return best
+
+
+def _keep_better(found: dict[tuple[Any, ...], Verdict], key: tuple[Any, ...], new: Verdict) -> None:
+    """Keeps the better of two settings; one that is not physical gives way to one that is."""
+    old = found.get(key)
+    if old is None or (new.possible, new.evidence) > (old.possible, old.evidence):
+        found[key] = new
+
+
+def _order(verdict: Verdict) -> float:
+    return verdict.evidence
+
+
+def _verdict(
+    gram: Gram, hypothesis: Hypothesis, explained: float, freedom: int, tests: float
+) -> Verdict:
+    p = corrected(min(1.0, chance(explained, freedom) * hypothesis.tests), tests)
+    price = freedom * np.log(gram.count) + 2 * np.log(hypothesis.tests)
+    possible = freedom > 0 and _within_bounds(gram, hypothesis)
+    return Verdict(
+        hypothesis=hypothesis,
+        evidence=explained - float(price),
+        explained=explained,
+        freedom=freedom,
+        p_value=p,
+        possible=possible,
+    )
+
+
+def _within_bounds(gram: Gram, hypothesis: Hypothesis) -> bool:
+    """Whether the predicted amplitudes are physical (a drag that pushes is not)."""
+    values, _ = gram.amplitude(hypothesis.columns)
+    return all(
+        low < value < high
+        for value, low, high in zip(values, hypothesis.lower, hypothesis.upper, strict=True)
+    )
+
+
+def _floor(
+    fit: Fit | Comparison, data: Data, rest: np.ndarray, lost: int
+) -> Float[np.ndarray, "recordings joints"]:
+    """Relative error by recording and joint of noise alone, what the model took of it put back."""
+    outputs = data.residual.shape[2]
+    freedom = 1 - (data.base.shape[-1] + lost) / (data.mask.sum() * outputs)
+    # What is least once whitened may be more than what the model leaves as it is.
+    share = np.minimum(share_left(fit, data, rest), 1) / np.sqrt(max(freedom, 0.1))
+    return fit.error_percent.to_numpy() * share

@@ -1,0 +1,97 @@
+"""Relative errors, by recording and by step."""
+
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from textwrap import wrap
+
+import numpy as np
+import plotly.graph_objects as go
+from jaxtyping import Float
+
+from .look import DASHES, MARKERS, PALETTE, PATTERNS, bar, finish, floor_line, with_unit
+
+
+def error_bars(
+    labels: Sequence[str],
+    groups: Sequence[str],
+    values: Float[np.ndarray, "groups labels"],
+    floor: Float[np.ndarray, " labels"] | None = None,
+    *,
+    x_name: str = "joint",
+    title: str | None = None,
+) -> go.Figure:
+    """Draw the relative error as grouped bars, with the noise floor as a line across each group.
+
+    Arguments:
+        labels: One for each group of bars, such as joints.
+        groups: One for each bar of a group, such as recordings.
+        values: Relative error in %, shape `(groups, labels)`.
+        floor: Error in % that noise alone leaves, shape `(labels,)`.
+        x_name: What the labels are.
+        title: Of the whole figure.
+    """
+    figure = go.Figure()
+    place = np.arange(len(labels), dtype=float)
+    styles = zip(cycle(PALETTE), cycle(PATTERNS))
+    for group, row, (colour, pattern) in zip(groups, values, styles, strict=False):
+        marker = bar(colour, pattern)
+        hover = f"{group}, %{{x}}: %{{y:.3~g}} %<extra></extra>"
+        figure.add_bar(x=place, y=row, name=group, marker=marker, hovertemplate=hover)
+    if floor is not None:
+        half = 0.42
+        x = np.stack([place - half, place + half, np.full_like(place, np.nan)], axis=1).ravel()
+        figure.add_scatter(x=x, y=np.repeat(floor, 3), **floor_line())
+    figure.update_xaxes(
+        title_text=x_name, tickvals=place, ticktext=list(labels), showgrid=False, zeroline=False
+    )
+    figure.update_yaxes(title_text=with_unit("relative error", "%"), rangemode="tozero")
+    figure.update_layout(barmode="group")
+    return finish(figure, title, height=380, legend=True)
+
+
+def error_falling(
+    steps: Sequence[str],
+    series: Mapping[str, Float[np.ndarray, "steps joints"]],
+    floor: Float[np.ndarray, " joints"] | None = None,
+    *,
+    joint_names: Sequence[str] | None = None,
+    title: str | None = None,
+) -> go.Figure:
+    """Draw the relative error of each joint, step by step.
+
+    Arguments:
+        steps: What each step added, the start first.
+        series: Relative error in %, shape `(steps, joints)`, by the name of the recordings it was
+            taken on: the first is drawn solid (fitted), the next dashed (held out).
+        floor: Error in % that noise alone leaves, shape `(joints,)`; dotted.
+        joint_names: As printed; "joint 1" and so on if absent.
+        title: Of the whole figure.
+    """
+    figure = go.Figure()
+    place = np.arange(len(steps), dtype=float)
+    joints = max((values.shape[1] for values in series.values()), default=0)
+    names = joint_names or [f"joint {joint + 1}" for joint in range(joints)]
+    for joint, (name, colour, marker) in enumerate(zip(names, cycle(PALETTE), cycle(MARKERS))):
+        for (kind, values), dash in zip(series.items(), cycle(DASHES)):
+            open_marker = marker if dash == "solid" else f"{marker}-open"
+            figure.add_scatter(
+                x=place,
+                y=values[:, joint],
+                name=f"{name}, {kind}",
+                mode="lines+markers",
+                line={"color": colour, "dash": dash, "width": 2},
+                marker={"symbol": open_marker, "size": 9},
+            )
+        if floor is not None:
+            line = floor_line(f"{name}, noise floor", colour)
+            figure.add_scatter(x=place[[0, -1]], y=np.full(2, floor[joint]), **line)
+    figure.update_xaxes(
+        title_text="step",
+        tickvals=place,
+        ticktext=["<br>".join(wrap(step, 16)) for step in steps],
+        range=[-0.35, len(steps) - 0.65],
+        showgrid=False,
+        zeroline=False,
+    )
+    figure.update_yaxes(title_text=with_unit("relative error", "%"), rangemode="tozero")
+    return finish(figure, title, height=430, legend=True)

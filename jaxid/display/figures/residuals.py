@@ -1,0 +1,110 @@
+"""Residuals: their autocorrelation, and what they depend on."""
+
+import numpy as np
+import plotly.graph_objects as go
+from jaxtyping import Float, Real
+
+from .look import BLUE, INK, finish, with_unit
+from .panels import add_acf, band_trace, small
+
+MAX_DOTS = 2000
+
+
+def autocorrelation(
+    lags: Real[np.ndarray, " lags"],
+    acf: Float[np.ndarray, " lags"],
+    bound: float,
+    *,
+    title: str | None = None,
+) -> go.Figure:
+    """Draw an autocorrelation with the band in which a white residual's would lie.
+
+    Arguments:
+        lags: In samples, shape `(lags,)`.
+        acf: Autocorrelation, shape `(lags,)`.
+        bound: Two standard deviations of a white residual's autocorrelation.
+        title: Of the whole figure.
+    """
+    figure = go.Figure().set_subplots(rows=1, cols=1)
+    add_acf(figure, lags, acf, bound, 1, 1)
+    figure.update_xaxes(title_text="lag (samples)")
+    figure.update_yaxes(title_text="autocorrelation")
+    return finish(figure, title, height=340, legend=False)
+
+
+def curve_fit(
+    x: Float[np.ndarray, " samples"],
+    y: Float[np.ndarray, " samples"],
+    x_name: str,
+    x_unit: str,
+    y_unit: str,
+    curve_x: Float[np.ndarray, " points"],
+    curve: Float[np.ndarray, " points"],
+    band: Float[np.ndarray, " points"] | None = None,
+    *,
+    y_name: str = "residual",
+    curve_name: str = "fitted curve",
+    title: str | None = None,
+) -> go.Figure:
+    """Draw a residual against a coordinate, with a fitted curve and its confidence band.
+
+    Arguments:
+        x: Coordinate in `x_unit`, shape `(samples,)`.
+        y: Residual in `y_unit`, shape `(samples,)`; at most 2000 samples are drawn.
+        x_name: What the coordinate is, such as "velocity of joint 2".
+        x_unit: Unit, as printed.
+        y_unit: Unit, as printed.
+        curve_x: Where the curve is given, in `x_unit`, ascending, shape `(points,)`.
+        curve: Fitted curve in `y_unit`, shape `(points,)`.
+        band: Half-width of the confidence band in `y_unit`, shape `(points,)`.
+        y_name: What is drawn upwards.
+        curve_name: What the legend calls the curve.
+        title: Of the whole figure.
+    """
+    figure = go.Figure()
+    # Every k-th sample would beat with a periodic motion; a drawn sample does not.
+    few = np.sort(np.random.default_rng(0).permutation(len(x))[:MAX_DOTS])
+    name = y_name if len(few) == len(x) else f"{y_name} ({len(few)} of {len(x)} samples)"
+    dots = {"color": INK, "size": 3.5, "opacity": 0.6}
+    figure.add_scatter(x=small(x[few]), y=small(y[few]), name=name, mode="markers", marker=dots)
+    if band is not None:
+        figure.add_trace(band_trace("confidence band", curve_x, curve - band, curve + band))
+    line = {"color": BLUE, "width": 2.6}
+    figure.add_scatter(x=curve_x, y=curve, name=curve_name, mode="lines", line=line)
+    figure.update_xaxes(title_text=with_unit(x_name, x_unit))
+    figure.update_yaxes(title_text=with_unit(y_name, y_unit))
+    return finish(figure, title, height=400, legend=True)
+
+
+def dependence(
+    x: Float[np.ndarray, " samples"],
+    y: Float[np.ndarray, " samples"],
+    x_name: str,
+    x_unit: str,
+    y_unit: str,
+    *,
+    y_name: str = "residual",
+    title: str | None = None,
+) -> go.Figure:
+    """Draw a residual against a coordinate, with its mean in stretches of equal count.
+
+    The band is two standard errors either side, as of independent samples.
+
+    Arguments:
+        x: Coordinate in `x_unit`, shape `(samples,)`.
+        y: Residual in `y_unit`, shape `(samples,)`.
+        x_name: What the coordinate is, such as "velocity of joint 2".
+        x_unit: Unit, as printed.
+        y_unit: Unit, as printed.
+        y_name: What is drawn upwards.
+        title: Of the whole figure.
+    """
+    order = np.array_split(np.argsort(x, kind="stable"), max(2, min(30, len(x) // 20)))
+    middle = np.array([np.median(x[k]) for k in order])
+    mean = np.array([np.mean(y[k]) for k in order])
+    error = np.array([2 * np.std(y[k]) / np.sqrt(len(k)) for k in order])
+    # A coordinate that stands still gives several stretches one place, which a line cannot have.
+    distinct = np.append(True, np.diff(middle) > 0)
+    line = middle[distinct], mean[distinct], error[distinct]
+    names = {"y_name": y_name, "curve_name": "mean", "title": title}
+    return curve_fit(x, y, x_name, x_unit, y_unit, *line, **names)

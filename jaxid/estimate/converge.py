@@ -1,0 +1,222 @@
+"""Output error minimised, with the weights and initial states that follow, until they settle."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..control import OpenLoop
+from ..noise import ARFilter, Noise, VectorAR
+from ..parameters import Bounds
+from ..recording import Recording, Recordings
+from ..simulation.batch import Batch, prepare
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import simulate_batch
+from ..simulation.sharing import taken
+from ..simulation.steps import refined, set_substeps
+from .covariance import Optimum
+from .minimise import Minimum, Point, Problem, Stopping, minimise, reweighted
+from .pieces import (
+    OutputErrorSettings,
+    compared_signals,
+    estimated_starts,
+    first_weights,
+    pieces_of,
+)
+from .result import Status
+
+
+class Converged(eqx.Module):
+    """A converged (or not) minimisation, with what is needed to report it."""
+
+    loop: ClosedLoop
+    pieces: tuple[Recording, ...]
+    batch: Batch
+    weights: Float[Array, " outputs"]
+    minimum: Minimum
+    problem: Problem
+    signals: tuple[str, ...] = eqx.field(static=True)
+    iterations: int = eqx.field(static=True)
+
+    @property
+    def optimum(self) -> Optimum:
+        """Where it ended, for whatever asks how sure that is."""
+        point = self.minimum.point
+        return Optimum(self.problem, point.theta, point.start)
+
+
+def converge(
+    method: OutputErrorSettings,
+    loop: ClosedLoop,
+    recordings: Recordings,
+    say: Callable[[str], None],
+    filters: Noise = None,
+    deadline: float = math.inf,
+    weights: Float[Array, " outputs"] | None = None,
+    batch: Batch | None = None,
+) -> Converged:
+    """Minimises, then again with the weights and initial states that follow, until they settle.
+
+    **Arguments:**
+
+    - `filters`: noise filter of each output; white noise where None.
+    - `deadline`: of `time.perf_counter`; past it, what there is is given.
+    - `weights`: to begin with, if they are about known; filters know theirs.
+    - `batch`: the pieces prepared, if they are already.
+    """
+    pieces = pieces_of(recordings, method.window)
+    signals = compared_signals(method, loop)
+    batch = prepare(loop, pieces) if batch is None else batch
+    free = jnp.asarray(estimated_starts(method, pieces, batch))
+    first = jnp.asarray(first_weights(loop, pieces, signals))
+    bounds = Bounds.of(loop.free_parameters)
+    start = jnp.asarray(np.concatenate([batch.q0, batch.v0], axis=1))
+    if weights is None and filters is not None:
+        weights = _weights_of(filters, first)
+    # The weight of a lone output is but its unit.
+    alone = len(first) == 1
+    # Until the weights are known, a rough minimum is enough.
+    worth = 1e-4 if alone or weights is not None else 1e-2
+    weights = first if weights is None else weights
+
+    def posed(weights: Float[Array, " outputs"]) -> Problem:
+        within = bounds.lower, bounds.upper
+        noise = jnp.asarray(_taps(filters, weights))
+        kinds = signals, bool(free.any()), method.mesh
+        mix = _mix(filters, weights)
+        return Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix)
+
+    total, minimum, problem, ratio = 0, None, posed(weights), jnp.ones_like(first)
+    for _ in range(20):
+        left = method.max_steps - total
+        known = None if minimum is None else reweighted(problem, minimum.point, ratio)
+        settings = Stopping(method.tolerance, worth, left, deadline, method.solver)
+        minimum = minimise(problem, loop.theta, start, settings, say, known)
+        total += minimum.iterations
+        if not minimum.status.simulated:
+            break
+        loop, start = loop.with_theta(minimum.point.theta), minimum.point.start
+        new = _new_weights(minimum.point, problem, first)
+        # Estimates are flat in the weights: those that are a tenth off cost half a percent.
+        floor = bool(np.all(np.asarray(new) > 0.99 / _FLOOR * np.asarray(first)))
+        if minimum.status is Status.stalled and floor:
+            # Only rounding is left, in which no step finds less.
+            minimum = dataclasses.replace(minimum, status=Status.converged)
+        settled = bool(np.all(np.abs(np.asarray(new) / np.asarray(weights) - 1) < 0.1))
+        ended = total >= method.max_steps or minimum.status is Status.max_seconds
+        if ended or (settled and worth < 1e-2):
+            break
+        ratio, weights, worth = new / weights, new, 1e-4 if settled else worth
+        problem = posed(weights)
+        if alone:
+            there = reweighted(problem, minimum.point, ratio)
+            minimum = dataclasses.replace(minimum, point=there)
+            break
+    assert minimum is not None
+    return Converged(
+        loop=loop,
+        pieces=pieces,
+        batch=batch,
+        weights=problem.weights,
+        minimum=minimum,
+        problem=problem,
+        signals=signals,
+        iterations=total,
+    )
+
+
+def _weights_of(filters: Noise, first: Float[Array, " outputs"]) -> Float[Array, " outputs"]:
+    """One over the deviation of what each filter leaves, with a floor of the signal's size."""
+    if isinstance(filters, VectorAR):
+        variance = np.diag(filters.covariance)
+    else:
+        variance = np.array([f.variance for f in filters or ()])
+    return jnp.asarray(1 / np.maximum(np.sqrt(variance), _FLOOR / np.asarray(first)))
+
+
+def _taps(filters: Noise, weights: Float[Array, " outputs"]) -> Float[np.ndarray, "..."]:
+    """Noise filters of the weighted outputs, padded so that few lengths ever get compiled."""
+    w = np.asarray(weights)
+    if isinstance(filters, VectorAR):
+        scale = np.outer(w, 1 / w)[..., None]
+        return scale * filters.taps(32 * (filters.order // 32 + 1))
+    longest = max((f.order for f in filters or ()), default=0)
+    size = 32 * (longest // 32 + 1)
+    white = ARFilter(np.zeros(0), 1.0)
+    return np.stack([f.taps(size) for f in filters or [white] * len(w)])
+
+
+def _mix(filters: Noise, weights: Float[Array, " outputs"]) -> Float[Array, "..."] | None:
+    """What makes the innovations of a vector filter white; other filters' are taken for it."""
+    if not isinstance(filters, VectorAR):
+        return None
+    w = np.asarray(weights)
+    root = np.linalg.cholesky(filters.covariance * np.outer(w, w))
+    return jnp.asarray(np.linalg.inv(root))
+
+
+def _new_weights(
+    point: Point, problem: Problem, first: Float[Array, " outputs"]
+) -> Float[Array, " outputs"]:
+    """One over each output's residual deviation; recorded noise-free outputs keep a floor.
+
+    The floor is of the signal's size: one of the present weights would rise from round to round.
+    """
+    residual, now = np.asarray(point.found.residual), np.asarray(problem.weights)
+    samples = np.sum(np.asarray(problem.batch.kept))
+    spread = np.sqrt(np.einsum("rko,rko->o", residual, residual) / samples) / now
+    return jnp.asarray(1 / np.maximum(spread, _FLOOR / np.asarray(first)))
+
+
+# Share of a tenth of a signal below which its residual is rounding.
+_FLOOR = 1e-10
+
+
+def finer_substeps(done: Converged) -> int | None:
+    """A finer number of substeps, if halving the step moves the torque by more than 1e-4."""
+    if not done.minimum.status.simulated or done.loop.stepping.control is not None:
+        return None
+    if isinstance(done.loop.controller, OpenLoop):
+        return None
+    now, batch = done.loop.stepping.substeps or 1, done.batch
+    # A few recordings fit the program that there is already; of many one says enough.
+    if len(done.pieces) > 4:
+        shortest = int(np.argmin([piece.samples for piece in done.pieces]))
+        batch = taken(batch, np.array([shortest]))
+    runs = [simulate_batch(set_substeps(done.loop, k), batch).tau for k in (now, 2 * now)]
+    coarse, fine = (x if batch.band is None else batch.band(jnp.asarray(x)) for x in runs)
+    there = np.asarray(batch.kept)
+    coarse, fine = np.asarray(coarse)[there], np.asarray(fine)[there]
+    size = np.linalg.norm(fine, axis=0)
+    error = np.linalg.norm(coarse - fine, axis=0) / np.where(size > 0, size, 1.0)
+    if not np.isfinite(error).all() or error.max() <= 1e-4:
+        return None
+    # A method of order p leaves 2⁻ᵖ of its error at half the step.
+    power = 1.2 / (done.loop.stepping.solver.order(None) or 1)
+    return refined(now * (error.max() / 1e-4) ** power + 1, done.loop.name)
+
+
+def from_best_starts(
+    method: OutputErrorSettings, loop: ClosedLoop, recordings: Sequence[Recording], batch: Batch
+) -> Batch:
+    """The batch with initial states at which the loop does best, where the method estimates them.
+
+    A recording that starts in motion, or that sensors which are off set in motion at once, tells
+    its first velocity badly; a fit estimates it, and what is held against a fit must as well.
+    """
+    signals, free = compared_signals(method, loop), estimated_starts(method, recordings, batch)
+    if not free.any():
+        return batch
+    weights = jnp.asarray(first_weights(loop, tuple(recordings), signals))
+    noise = jnp.asarray(_taps(None, weights))
+    # Parameters stay where they are: between bounds that leave them no room.
+    at, own = loop.theta, jnp.asarray(free)
+    problem = Problem(loop, batch, weights, noise, own, at, at, signals, True)
+    start = jnp.concatenate([batch.q0, batch.v0], axis=1)
+    found = minimise(problem, at, start, Stopping(method.tolerance, 1e-4, 20))
+    best, n = found.point.start, loop.joints
+    return dataclasses.replace(batch, q0=best[:, :n], v0=best[:, n:])

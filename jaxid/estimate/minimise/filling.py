@@ -1,0 +1,65 @@
+"""Unknowns filled up, so that the solver is compiled for few numbers of them."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .arrow import Arrow, Unknowns
+from .descent import Products
+from .problem import Problem, Sums
+
+# Unknowns are filled up to multiples of this many, so that few programs serve all models.
+_FILL = 8
+
+
+class Filling(eqx.Module):
+    """Fills unknowns up with some that nothing depends on, which stay where they are."""
+
+    parameters: int = eqx.field(static=True)
+    recordings: int = eqx.field(static=True)
+    estimated: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, problem: Problem) -> "Filling":
+        count = problem.free.shape[0] if problem.free_start else 0
+        each = 2 * problem.loop.joints if problem.free_start else 0
+        return cls(problem.lower.shape[0], count, each)
+
+    def _room(self) -> tuple[int, int]:
+        return -self.parameters % _FILL, -self.recordings % _FILL
+
+    def ends(self, bound: Float[Any, " parameters"], beyond: float) -> Float[np.ndarray, " filled"]:
+        """Bounds of all."""
+        return np.append(bound, np.full(self._room()[0], beyond))
+
+    def unknowns(
+        self, y: Unknowns
+    ) -> tuple[Float[Array, " filled"], Float[Array, "places estimated"]]:
+        """Values of all."""
+        p, r = self._room()
+        theta, start = np.pad(y[0], (0, p)), np.pad(y[1], ((0, r), (0, 0)))
+        return jnp.asarray(theta), jnp.asarray(start)
+
+    def emptied(
+        self, y: tuple[Float[Any, " filled"], Float[Any, "places estimated"]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Values of those that there were."""
+        return np.asarray(y[0])[: self.parameters], np.asarray(y[1])[: self.recordings]
+
+    def products(self, sums: Sums, loss: Float[Any, ""]) -> Products:
+        """Products with all, of sums on the host.
+
+        **Arguments:**
+
+        - `loss`: infinite where the point is no good.
+        """
+        p, r = self._room()
+        _, gram, slope, start_gram, start_slope, cross = sums.added()
+        grad = np.pad(slope, (0, p)), np.pad(start_slope, ((0, r), (0, 0)))
+        dense, blocks = np.pad(gram, (0, p)), np.pad(start_gram, ((0, r), (0, 0), (0, 0)))
+        return Products(
+            loss / 2, grad, Arrow(dense, blocks, np.pad(cross, ((0, r), (0, 0), (0, p))))
+        )

@@ -1,0 +1,143 @@
+"""A problem linearised over shares of its recordings: cores, devices, stretches of time."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from jaxtyping import Array, Bool, Float, Int
+
+from ...simulation.sharing import (
+    EndToEnd,
+    at_once,
+    cores,
+    everywhere,
+    of_this_machine,
+    shares_of,
+    taken,
+)
+from .problem import Point, Problem, Sums, point_around
+from .residual import Sensitivity
+from .stretches import Stretches
+
+
+def linearise(
+    problem: Problem,
+    theta: Float[Any, " parameters"],
+    start: Float[Any, "recordings initials"],
+) -> Sensitivity:
+    """Residual and derivatives at parameter values and initial states, all in memory."""
+    return linearisation(problem, whole=True)(theta, start).found
+
+
+def with_derivatives(problem: Problem, point: Point) -> Sensitivity:
+    """Residual and derivatives at a point, computed again where they were not kept."""
+    if point.found.jacobian is not None:
+        return point.found
+    return linearise(problem, point.theta, point.start)
+
+
+def linearisation(problem: Problem, whole: bool = False) -> Callable[[Any, Any], Point]:
+    """The function that linearises a problem, which is shared out but once.
+
+    Recordings are shared out over the cores or over the problem's mesh. With a mesh every process
+    has the whole of it afterwards.
+
+    **Arguments:**
+
+    - `whole`: keep all derivatives; otherwise only where they are small.
+    """
+    mesh = problem.mesh
+    if mesh is not None and not of_this_machine(mesh):
+        return lambda theta, start: _over_mesh(problem, mesh, theta, start)
+    # Host devices would each compile the program, and take turns to put results together.
+    problem = dataclasses.replace(problem, mesh=None)
+    threads = cores() if mesh is None else mesh.size
+    recordings, samples = problem.batch.mask.shape
+    if recordings * samples <= _WORTH_SHARING:
+        threads = 1
+    size = problem.lower.shape[0] + 2 * problem.loop.joints * problem.free_start
+    kept = whole or recordings * samples * problem.weights.shape[0] * size <= _KEPT
+    if samples > _AT_A_TIME and problem.batch.band is None:
+        rows = shares_of(recordings, recordings)
+        parts = [Stretches.of(_share(problem, row), _AT_A_TIME, kept) for row in rows]
+        return _Shared(parts, rows, threads)
+    rounds = -(-recordings * samples // (threads * _AT_A_TIME))
+    rows = shares_of(recordings, threads * rounds)
+    if len(rows) == 1:
+        return lambda theta, start: point_around(problem, jnp.asarray(theta), jnp.asarray(start))
+    return _Shared([_Part(_share(problem, row), kept) for row in rows], rows, threads)
+
+
+# Samples in all from which on threads gain more than they cost.
+_WORTH_SHARING = 3000
+# Samples of one share, and intervals of a stretch of a longer recording: intermediate results of
+# more would be fresh memory each time.
+_AT_A_TIME = 40_000
+# Derivatives that are kept at every point, 64 MB of them.
+_KEPT = 8_000_000
+
+
+class _Part(eqx.Module):
+    """The linearisation of one share."""
+
+    problem: Problem
+    whole: bool
+
+    def __call__(
+        self, theta: Float[Any, " parameters"], start: Float[Any, "rows initials"]
+    ) -> Point:
+        point = point_around(self.problem, theta, start)
+        if self.whole:
+            return point
+        few = dataclasses.replace(point.found, jacobian=None, start=None)
+        return dataclasses.replace(point, found=few)
+
+
+class _Shared(eqx.Module):
+    """The linearisation of all recordings by shares, which threads take in turn."""
+
+    parts: list[Any]
+    rows: list[Int[np.ndarray, " rows"]]
+    threads: int
+
+    def __call__(
+        self, theta: Float[Any, " parameters"], start: Float[Any, "recordings initials"]
+    ) -> Point:
+        kept = EndToEnd(len(self.parts))
+        theta, start = jnp.asarray(theta), np.asarray(start)
+
+        def part(k: int) -> tuple[Array, ...]:
+            point = self.parts[k](theta, taken(start, self.rows[k]))
+            sums = point.sums
+            own = sums.start_gram, sums.start_slope, sums.cross
+            kept.put(k, (point.found, tuple(np.moveaxis(np.asarray(x), 1, 0) for x in own)))
+            return point.loss, sums.loss, sums.gram, sums.slope
+
+        parts = at_once(part, range(len(self.parts)), self.threads)
+        found, own = kept.whole(len(start))
+        # Where a step diverges, infinities of both signs meet: it is refused, and no warning.
+        with np.errstate(invalid="ignore"):
+            loss, *sums = (np.sum(np.stack(x), axis=0) for x in zip(*parts, strict=True))
+        own = (np.moveaxis(np.asarray(x), 0, 1) for x in own)
+        return Point(theta, jnp.asarray(start), found, Sums(*sums, *own), loss)
+
+
+def _over_mesh(problem: Problem, mesh: Mesh, theta: Any, start: Any) -> Point:
+    point = point_around(*everywhere((problem, jnp.asarray(theta), jnp.asarray(start)), mesh))
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), point)
+
+
+def _share(problem: Problem, rows: Int[np.ndarray, " rows"]) -> Problem:
+    """The problem of some recordings; one that comes again to fill up does not count."""
+    batch, free = taken((problem.batch, problem.free), rows)
+    new: Bool[Array, "rows 1"] = jnp.asarray(np.append(True, np.diff(rows) > 0))[:, None]
+    batch = dataclasses.replace(batch, mask=batch.mask & new)
+    if batch.band is not None:
+        kept = dataclasses.replace(batch.band, keep=batch.band.keep & new)
+        batch = dataclasses.replace(batch, band=kept)
+    return dataclasses.replace(problem, batch=batch, free=free)

@@ -1,0 +1,157 @@
+"""Levenberg–Marquardt as an optimistix solver that stops in standard deviations."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from .arrow import Arrow, Unknowns, empty_arrow
+from .descent import BoundedDescent, DescentState, Products, promised
+from .search import Nielsen, SearchState
+
+# Size of a step that is as good as undamped.
+FULL = 1e10
+# Accepted steps over which the loss must fall by `worth`.
+STEPS_JUDGED = 5
+# Damping from which on a step is shorter than rounding.
+LARGEST_DAMPING = 1e12
+
+
+class SolverState(eqx.Module):
+    """What the solver carries from step to step.
+
+    - `y_eval`: the point to be evaluated next. `first`: whether none was evaluated yet.
+    - `f_info`: products at the last accepted point; `accepted`: whether that is the newest.
+    - `result`: divergence where no step lowers the loss, however short.
+    - `losses`: of the last accepted points, newest last; infinite before there are as many.
+    """
+
+    y_eval: Unknowns
+    first: Bool[Any, ""]
+    accepted: Bool[Any, ""]
+    f_info: Products
+    losses: Float[Any, " judged"]
+    search: SearchState
+    descent: DescentState
+    terminate: Bool[Any, ""]
+    result: Any
+    steps: Int[Any, ""]
+
+
+class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """Damped Gauss-Newton steps inside bounds, for parameters and initial states together.
+
+    Unknowns are `(parameters, initial states by recording)`; the latter `(0, 0)` where there are
+    none. Supports the following `options`:
+
+    - `linearised`: `optimistix.FunctionInfo.EvalGradHessian` at the point to be evaluated, with
+      an `Arrow` for J'J, where the caller computes it (over threads, devices or pieces of a
+      recording); `fn` is not called then. By default by forward mode through `fn`.
+    - `rows`: how many residuals are not padding; by default all.
+
+    **Arguments:**
+
+    - `descent`: the step for a given damping. `search`: the damping.
+    - `tolerance`: it stops where a full step promises less than this many standard deviations, or
+    - `worth`: where five accepted steps together lower the loss by less than this share. Where
+      friction sticks, the loss has kinks: full steps keep promising what small ones do not find.
+    - `rtol`, `atol`, `norm`: of optimistix' interface; they are not used.
+    """
+
+    descent: BoundedDescent
+    search: Nielsen = Nielsen()
+    tolerance: float = 1e-2
+    worth: float = 1e-4
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Any = eqx.field(static=True, default=optx.max_norm)
+
+    def init(self, fn: Any, y: Unknowns, args, options, f_struct, aux_struct, tags) -> SolverState:
+        """The state before the first evaluation."""
+        y = jnp.clip(y[0], self.descent.lower, self.descent.upper), jnp.asarray(y[1])
+        zeros = jnp.zeros_like(y[0]), jnp.zeros_like(y[1])
+        blank = Products(jnp.zeros(()), zeros, empty_arrow(y))
+        return SolverState(
+            y_eval=y,
+            first=jnp.asarray(True),
+            accepted=jnp.asarray(False),
+            f_info=blank,
+            losses=jnp.full(STEPS_JUDGED + 1, jnp.inf, y[0].dtype),
+            search=self.search.init(y, blank),
+            descent=self.descent.init(y, blank),
+            terminate=jnp.asarray(False),
+            result=optx.RESULTS.successful,
+            steps=jnp.asarray(0),
+        )
+
+    def step(self, fn: Any, y: Unknowns, args, options, state: SolverState, tags):
+        """Evaluates the trial point, accepts or refuses it, and makes the next one."""
+        if "linearised" in options:
+            found, rows, aux = options["linearised"], options["rows"], None
+        else:
+            found, rows, aux = _linearised(fn, state.y_eval, args)
+        size, accepted, _, search = self.search.step(
+            state.first, y, state.y_eval, state.f_info, found, state.search
+        )
+
+        def chosen(new, old):
+            return jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, old)
+
+        y = chosen(state.y_eval, y)
+        descent = chosen(self.descent.query(y, found, state.descent), state.descent)
+        f_info = chosen(found, state.f_info)
+        losses = jnp.where(accepted, jnp.append(state.losses[1:], 2 * f_info.f), state.losses)
+        # Both steps by one piece of code, which is most of the program.
+        sizes = jnp.stack([size, jnp.full_like(size, FULL)])
+        diffs = jax.lax.map(lambda x: self.descent.step(x, descent)[0], sizes)
+        diff, full = (jax.tree.map(lambda x, k=k: x[k], diffs) for k in (0, 1))
+        # A full step's promise is its squared length in deviations times the residual's variance.
+        settled = 2 * promised(full, f_info) <= self.tolerance**2 * losses[-1] / rows
+        flat = losses[0] - losses[-1] < self.worth * losses[-1]
+        stuck = search.damping > LARGEST_DAMPING
+        state = SolverState(
+            y_eval=jax.tree.map(jnp.add, y, diff),
+            first=jnp.asarray(False),
+            accepted=accepted,
+            f_info=f_info,
+            losses=losses,
+            search=search,
+            descent=descent,
+            terminate=settled | flat | stuck,
+            result=optx.RESULTS.where(
+                stuck & ~settled & ~flat,
+                optx.RESULTS.nonlinear_divergence,
+                optx.RESULTS.successful,
+            ),
+            steps=state.steps + 1,
+        )
+        return y, state, aux
+
+    def terminate(self, fn: Any, y: Unknowns, args, options, state: SolverState, tags):
+        """Whether to stop, and why."""
+        return state.terminate, state.result
+
+    def postprocess(
+        self, fn: Any, y: Unknowns, aux, args, options, state: SolverState, tags, result
+    ):
+        """What `optimistix.least_squares` hands out."""
+        return y, aux, {}
+
+
+def _linearised(fn, y: Unknowns, args) -> tuple[Products, int, Any]:
+    """Products of a function's residual at a point, by forward mode."""
+
+    def flat(theta: Array, start: Array) -> tuple[Array, tuple[Array, Any]]:
+        residual, aux = fn((theta, start), args)
+        row = ravel_pytree(residual)[0]
+        return row, (row, aux)
+
+    (by_theta, by_start), (residual, aux) = jax.jacfwd(flat, (0, 1), has_aux=True)(*y)
+    cross = jnp.einsum("kra,kp->rap", by_start, by_theta)
+    hessian = Arrow(by_theta.T @ by_theta, jnp.einsum("kra,krb->rab", by_start, by_start), cross)
+    grad = residual @ by_theta, jnp.einsum("k,kra->ra", residual, by_start)
+    return Products(residual @ residual / 2, grad, hessian), residual.size, aux

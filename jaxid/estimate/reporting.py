@@ -1,0 +1,73 @@
+"""The `Fit` of a minimisation."""
+
+import numpy as np
+
+from ..noise import Noise, VectorAR
+from ..recording import Recordings
+from ..simulation.batch import compared
+from ..simulation.loop import ClosedLoop
+from .converge import Converged
+from .covariance import SAID, Deviations, covariance_of
+from .minimise import with_derivatives
+from .pieces import rejoined
+from .result import AbstractMethod, Fit, relative_errors
+
+
+def report(
+    kind: Deviations,
+    done: Converged,
+    recordings: Recordings,
+    seconds: float,
+    method: AbstractMethod,
+    noise: Noise = None,
+    rounds: int = 0,
+) -> Fit:
+    """The `Fit`.
+
+    **Arguments:**
+
+    - `method`: as results show it. `kind`: of deviations.
+    - `seconds`: that it took. `noise`: the filters found. `rounds`: of filters and parameters.
+    """
+    found, mask = done.minimum.point.found, np.asarray(done.batch.kept)
+    p = len(done.loop.names)
+    covariance, lost, said = np.full((p, p), np.inf), (), ""
+    if done.minimum.status.simulated:
+        whole = with_derivatives(done.problem, done.minimum.point)
+        covariance, lost = covariance_of(done.optimum, kind, noise, whole)
+        said = SAID[kind]
+    raw, weights = np.asarray(found.raw), np.asarray(done.weights)
+    unweighted = [raw[k][mask[k]] / weights for k in range(len(done.pieces))]
+    n = done.loop.joints
+    measured = [getattr(piece, done.signals[0]) for piece in done.pieces]
+    measured = compared(done.loop, done.pieces, measured)
+    errors = [r[:, :n] for r in unweighted]
+    measured, errors = rejoined(recordings, done.pieces, measured, errors)
+    notes = (*_at_bounds(done.loop), *done.minimum.notes)
+    return Fit(
+        loop=done.loop,
+        recordings=recordings,
+        method=method,
+        status=done.minimum.status,
+        covariance=covariance,
+        residuals=tuple(errors),
+        error_percent=relative_errors(recordings, measured, errors),
+        iterations=done.iterations,
+        seconds=seconds,
+        deviations=said,
+        undetermined=lost,
+        notes=notes,
+        noise=noise if noise is None or isinstance(noise, VectorAR) else tuple(noise),
+        rounds=rounds,
+        optimum=done.optimum,
+    )
+
+
+def _at_bounds(loop: ClosedLoop) -> list[str]:
+    notes = []
+    for p in loop.free_parameters:
+        value = np.ravel(np.asarray(p.where(loop)))
+        for bound, word in ((p.declaration.lower, "lower"), (p.declaration.upper, "upper")):
+            if np.isfinite(bound) and np.any(np.abs(value - bound) < 1e-9 * p.declaration.scale):
+                notes.append(f"{p.name} is at its {word} bound, {bound:g} {loop.unit(p)}")
+    return notes

@@ -1,0 +1,86 @@
+"""Where output error starts: the values of inverse dynamics, if those do better."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..control import OpenLoop
+from ..errors import JaxidError, ModelError
+from ..recording import Recordings
+from ..simulation.batch import Batch, prepare
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import simulate_batch
+from ..simulation.steps import with_substeps
+from .didim import DIDIM, physical
+from .idim import IDIM
+
+
+def start_values(
+    loop: ClosedLoop,
+    recordings: Recordings,
+    start: str,
+    say: Callable[[str], None],
+    batch: Batch | None = None,
+) -> ClosedLoop:
+    """The loop at the best start: its own values, IDIM's or DIDIM's, by simulated torque error.
+
+    DIDIM is asked only where the others leave much of the torque. Parameters in which torque is
+    not linear keep their values.
+
+    **Arguments:**
+
+    - `start`: `"given"` for the loop as it is, else `"auto"`.
+    - `batch`: the recordings prepared, if they are already.
+    """
+    if start == "given":
+        return loop
+    say("start values by inverse dynamics")
+    batch = prepare(loop, recordings) if batch is None else batch
+    candidates, errors = [loop], [_simulated_error(loop, recordings, batch)]
+    for values in (_by_idim, _by_didim):
+        try:
+            theta = values(candidates[-1], recordings)
+        except (JaxidError, np.linalg.LinAlgError):
+            continue
+        if np.isfinite(theta).all():
+            candidates.append(physical(loop, theta))
+            errors.append(_simulated_error(candidates[-1], recordings, batch))
+        if min(errors) < _NEAR:
+            break
+    if isinstance(loop.controller, OpenLoop):
+        return candidates[-1]
+    return candidates[int(np.argmin(errors))]
+
+
+def _by_idim(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " linear"]:
+    return IDIM().solved(loop, recordings)[1].theta
+
+
+def _by_didim(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " linear"]:
+    return np.asarray(DIDIM(max_steps=4).fit(loop, recordings).theta)
+
+
+# Share of the squared torque, mean over the joints, from which on a fit needs no better start.
+_NEAR = 0.2**2
+
+
+def _simulated_error(loop: ClosedLoop, recordings: Recordings, batch: Batch) -> float:
+    """Mean over joints of the squared relative torque error of a simulation; infinite if it fails.
+
+    An open loop has no torque to compare.
+    """
+    if isinstance(loop.controller, OpenLoop):
+        return np.inf
+    try:
+        tau = simulate_batch(with_substeps(loop, recordings), batch).tau
+    except ModelError:
+        return np.inf
+    there = np.asarray(batch.mask)[..., None]
+    measured, left = (np.where(there, x, 0.0) for x in (batch.tau, batch.tau - tau))
+    if batch.band is not None:
+        measured, left = batch.band(jnp.asarray(measured)), batch.band(jnp.asarray(left))
+    error, size = (np.sum(np.asarray(x) ** 2, axis=(0, 1)) for x in (left, measured))
+    total = float(np.mean(error / size))
+    return total if np.isfinite(total) else np.inf

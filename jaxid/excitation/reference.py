@@ -1,0 +1,117 @@
+"""An excitation: a reference that determines the parameters, and how well it will."""
+
+import html
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..display.shown import AbstractShown
+from ..recording import Recording
+from ..signals.fourier import FourierSeries
+from ..simulation.loop import ClosedLoop
+from ._information import torque_along
+from .limits import Limits, margins_along
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import plotly.graph_objects as go
+
+
+class Excitation(AbstractShown):
+    """A reference that determines the parameters, and how well it will.
+
+    - `series`: the reference as a Fourier series; `reference()` samples it.
+    - `std`: predicted standard deviations of the parameters `names`, for one period and the torque
+      noise that was assumed.
+    - `margins`: by limit and joint, how much of it is left, in percent; of the workspace what
+      its function leaves, as a rule m; none is negative.
+    - `score`: logarithm of the criterion, parameters in units of their scales; of the determinant
+      the root that makes it a deviation.
+    """
+
+    loop: ClosedLoop
+    series: FourierSeries
+    limits: Limits
+    covariance: Float[np.ndarray, "parameters parameters"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    undetermined: tuple[str, ...] = eqx.field(static=True)
+    margins: "pd.DataFrame"
+    score: float
+    rate: float = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+
+    @property
+    def std(self) -> Float[np.ndarray, " parameters"]:
+        """Predicted standard deviations, in the units of the parameters."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def reference(self, periods: int = 1, rate: float | None = None) -> Recording:
+        """The reference sampled, with the torque it takes as `tau`.
+
+        **Arguments:**
+
+        - `periods`: how often it is run through. `rate`: Hz; by default as it was designed for.
+        """
+        rate = rate or self.rate
+        time = np.arange(round(periods * self.series.period * rate) + 1) / rate
+        signals = np.asarray(self.series(time))
+        tau = np.asarray(torque_along(self.loop, jnp.asarray(time), jnp.asarray(signals)))
+        return Recording(time, signals[0], tau, q_ref=signals[0], v=signals[1], name="excitation")
+
+    def table(self) -> "pd.DataFrame":
+        """Predicted deviations."""
+        import pandas as pd
+
+        known = {n: self.loop.unit(p) for p in self.loop.parameters for n in p.names}
+        units = [known[name] for name in self.names]
+        return pd.DataFrame(
+            {"std": self.std, "unit": units}, index=pd.Index(self.names, name="parameter")
+        )
+
+    def plot(self) -> "go.Figure":
+        """The reference in time."""
+        from ..display import figures
+
+        r = self.reference()
+        units = self.loop.arm.units()[1]
+        panels = [
+            [figures.Trace(f"joint {j}", column, unit, "reference")]
+            for j, (column, unit) in enumerate(zip(r.q.T, units, strict=True), start=1)
+        ]
+        return figures.signals(r.time, panels)
+
+    def __repr__(self) -> str:
+        lines = [
+            self._head(),
+            self.table().to_string(float_format=lambda x: f"{x:.3g}"),
+            "left of the limits, %:",
+            self.margins.to_string(float_format=lambda x: f"{x:.3g}"),
+        ]
+        return "\n".join([*lines, *self.undetermined])
+
+    def _repr_html_(self) -> str:
+        foot = "".join(f"<p>{html.escape(s)}</p>" for s in self.undetermined)
+        return (
+            f"<p>{html.escape(self._head())}</p>"
+            f"{self.table().to_html(float_format=lambda x: f'{x:.3g}')}"
+            f"<p>left of the limits, %</p>{self.margins.to_html(float_format='%.3g')}{foot}"
+        )
+
+    def _head(self) -> str:
+        return (
+            f"a reference of {self.series.period:g} s and {self.series.harmonics} harmonics for "
+            f"{self.loop.name}, by its {self.kind} information"
+        )
+
+
+def margins_on(
+    excitation: Excitation, time: Float[np.ndarray, " points"]
+) -> Float[np.ndarray, "points kinds"]:
+    """How far a reference is from each limit at times, s, as a share of it."""
+    signals = jnp.asarray(excitation.series(time))
+    tau = torque_along(excitation.loop, jnp.asarray(time), signals)
+    rows, inside = margins_along(excitation.limits, signals, tau)
+    return np.concatenate([np.asarray(rows).reshape(len(rows), -1), np.asarray(inside)], axis=1)

@@ -1,0 +1,71 @@
+"""What it takes to do the same again: versions, recordings and settings."""
+
+import hashlib
+import json
+import platform
+from importlib import metadata
+
+import numpy as np
+
+from ..discovery import Discovery
+from ..recording import Recording
+from ._html import Content, Markup, details, join, section, table, tag
+
+
+def settings(story: Discovery) -> Markup:
+    """Versions, recordings and settings, so that another can do it again."""
+    fit = story.steps[0].fit
+    packages = ("jaxid-robotics", "jax", "jaxlib", "diffrax", "equinox", "numpy", "scipy")
+    facts = [
+        ("robot", repr(fit.loop)),
+        ("effects at the end", ", ".join(_effects(story)) or "none"),
+        ("method of the last fit", repr(story.fit.method)),
+        ("significance", f"{story.diagnosis.significance:g}"),
+        ("took", f"{story.seconds:.0f} s"),
+        ("machine", platform.platform()),
+        ("Python", platform.python_version()),
+        *((package, _version(package)) for package in packages),
+    ]
+    rows = [[name, value] for name, value in facts]
+    recordings = [["fitted", *_recording(r)] for r in fit.recordings]
+    held = story.steps[0].held_out
+    if held is not None:
+        recordings += [["held out", *_recording(r)] for r in held.recordings]
+    columns = ["used", "recording", "samples", "duration, s", "rate, Hz", "SHA-256 of its numbers"]
+    whole = tag("pre", json.dumps(_plain(story.to_dict()), indent=1, ensure_ascii=False))
+    said = join("The story as ", tag("code", "jaxid discover --json"), " writes it")
+    return section(
+        "To do it again",
+        table(columns, recordings, "recordings"),
+        table(["setting", "value"], rows, "settings and versions"),
+        details(said, whole, class_="raw"),
+    )
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(inner) for inner in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _effects(story: Discovery) -> list[str]:
+    named = ((e.effect_name(), getattr(e, "joint", None)) for e in story.loop.effects)
+    return [name if joint is None else f"{name}({joint})" for name, joint in named]
+
+
+def _recording(recording: Recording) -> list[Content]:
+    digest = hashlib.sha256()
+    for signal in (recording.time, recording.q, recording.tau, recording.q_ref, recording.v):
+        if signal is not None:
+            digest.update(np.ascontiguousarray(signal, dtype="<f8").tobytes())
+    size = [recording.samples, recording.duration, recording.rate]
+    return [recording.name, *size, digest.hexdigest()[:16]]
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed as a package"

@@ -1,0 +1,292 @@
+"""Recordings as a batch of intervals that drive a loop: made on the host, with NumPy."""
+
+import zlib
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Array, Bool, Float, Int
+
+from ..control import Reading, Reference
+from ..errors import JaxidError, ModelError, RecordingError
+from ..recording import Recording, Recordings
+from ..signals.smoothing import Band
+from .loop import ClosedLoop
+
+# Of no recording: effects that act on some by name do not act.
+NOBODY = 0
+
+
+class Interval(eqx.Module):
+    """What drives the loop from one grid point to the next; the last interval has no length.
+
+    `reference` holds the coefficients of the interval's cubic, `torque` those of a line; `noise`
+    and `rate` are added to the position and velocity that the sensors read, `push` and `pull` to
+    the torque on drives and links, each given at both ends and joined by a line, or None.
+    """
+
+    t0: Float[Array, ""]
+    h: Float[Array, ""]
+    tick: Bool[Array, ""]
+    label: Int[Array, ""]
+    reference: Float[Array, "4 joints"]
+    torque: Float[Array, "2 joints"]
+    noise: Float[Array, "2 joints"] | None = None
+    rate: Float[Array, "2 joints"] | None = None
+    push: Float[Array, "2 joints"] | None = None
+    pull: Float[Array, "2 joints"] | None = None
+
+
+class Batch(eqx.Module):
+    """Recordings padded to one length, so that one `vmap` covers them.
+
+    `intervals` has `(recordings, points)` before the axes of each leaf. `at` says which grid
+    points are samples, `mask` which of those are there; the initial state is `q0`, `v0`; `q`,
+    `tau` are the measured signals. `band` says which part of them the controller lets compare,
+    None for all.
+    """
+
+    intervals: Interval
+    at: Int[Array, "recordings samples"] | None
+    mask: Bool[Array, "recordings samples"]
+    q0: Float[Array, "recordings joints"]
+    v0: Float[Array, "recordings joints"]
+    time: Float[Array, "recordings samples"]
+    q: Float[Array, "recordings samples joints"]
+    tau: Float[Array, "recordings samples joints"]
+    band: Band | None = None
+
+    @property
+    def kept(self) -> Bool[Array, "recordings samples"]:
+        """Which samples are there and compared."""
+        return self.mask if self.band is None else self.band.keep
+
+
+def recording_label(name: str) -> int:
+    """The number by which effects know a recording of that name."""
+    return zlib.crc32(name.encode()) & 0x7FFFFFFF
+
+
+def _pieces(
+    time: np.ndarray, values: np.ndarray, at: np.ndarray, kind: str, order: int
+) -> np.ndarray:
+    """Taylor coefficients of an interpolant at the grid points, `(points, order + 1, joints)`."""
+    beyond = np.append(time, time[-1] + 1.0)
+    if kind == "cubic" and order == 3:
+        spline = scipy.interpolate.CubicSpline(time, values)
+    else:
+        slope = np.zeros_like(values)
+        if kind != "hold":
+            slope[:-1] = np.diff(values, axis=0) / np.diff(time)[:, None]
+        spline = scipy.interpolate.PPoly(np.stack([slope, values]), beyond)
+    factorial = (1.0, 1.0, 2.0, 6.0)
+    return np.stack([spline(at, nu) / factorial[nu] for nu in range(order + 1)], axis=1)
+
+
+def _grid(recording: Recording, period: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Grid times and which of them are ticks: the samples, and the controller's own instants."""
+    time = recording.time
+    if period is None:
+        grid = _without_gaps(time, recording.period)
+        return grid, np.zeros(len(grid), bool)
+    ticks = time[0] + period * np.arange(int((time[-1] - time[0]) / period + 1e-6) + 1)
+    # Instants closer than a thousandth of a period are the same: clocks are written in decimals.
+    near = time[np.clip(np.searchsorted(time, ticks - 1e-3 * period), 0, len(time) - 1)]
+    ticks = np.where(np.abs(near - ticks) < 1e-3 * period, near, ticks)
+    grid = np.union1d(time, ticks)
+    return grid, np.isin(grid, ticks)
+
+
+def _without_gaps(
+    time: Float[np.ndarray, " samples"], period: float
+) -> Float[np.ndarray, " points"]:
+    """The samples, and evenly between them where they are further apart than usual."""
+    parts = np.maximum(np.round(np.diff(time) / period - 0.25), 1).astype(int)
+    if parts.max() == 1:
+        return time
+    first = np.repeat(time[:-1], parts)
+    step = np.repeat(np.diff(time) / parts, parts)
+    number = np.arange(len(first)) - np.repeat(np.cumsum(parts) - parts, parts)
+    return np.append(first + number * step, time[-1])
+
+
+def _drive(
+    loop: ClosedLoop,
+    recording: Recording,
+    points: tuple[np.ndarray, np.ndarray],
+    length: int,
+    noise: np.ndarray | None,
+) -> tuple[np.ndarray | None, ...]:
+    """The fields of the intervals of one recording, each with `length` points."""
+    grid, ticks = points
+    signals = loop.controller.signals(recording)
+    kind = loop.stepping.interpolation
+    pad = length - len(grid)
+
+    def padded(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([values, np.repeat(values[-1:], pad, axis=0)])
+
+    ends = rate = None
+    if noise is not None:
+        lines = padded(_pieces(recording.time, noise, grid, "linear", 1))
+        ends = np.stack([lines[:, 0], np.append(lines[1:, 0], lines[-1:, 0], axis=0)], axis=1)
+        rate = np.stack([lines[:, 1], lines[:, 1]], axis=1)
+    return (
+        padded(grid),
+        np.append(np.diff(grid), np.zeros(pad + 1)),
+        np.append(ticks, np.zeros(pad, bool)),
+        np.full(length, recording_label(recording.name)),
+        padded(_pieces(recording.time, signals.q, grid, kind, 3)),
+        padded(_pieces(recording.time, signals.tau, grid, "linear", 1)),
+        ends,
+        rate,
+    )
+
+
+def start_of(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity at the first sample, `(joints,)`: a parabola through the first ten."""
+    few = min(10, recording.samples)
+    t = recording.time[:few] - recording.time[0]
+    _, slope, level = np.polyfit(t, recording.q[:few], 2)
+    return (level, slope) if recording.v is None else (level, recording.v[:3].mean(axis=0))
+
+
+def at_rest(recording: Recording) -> bool:
+    """Whether the arm starts with less than a hundredth of its highest speed."""
+    _, start = start_of(recording)
+    step = min(10, recording.samples - 1)
+    speed = (recording.q[step:] - recording.q[:-step]) / (
+        recording.time[step:] - recording.time[:-step]
+    )[:, None]
+    return bool(np.all(np.abs(start) < 1e-2 * np.abs(speed).max(axis=0)))
+
+
+def check_joints(loop: ClosedLoop, recording: Recording) -> None:
+    """Raises `RecordingError` where a recording has other joints than the loop."""
+    if recording.joints != loop.joints:
+        raise RecordingError(
+            f"{recording.name} has {recording.joints} joints, but the robot {loop.name} has "
+            f"{loop.joints}: choose another robot, or name the columns of its joints"
+        )
+
+
+def check_law(loop: ClosedLoop) -> None:
+    """Raises `ModelError` where a controller's gains are those of other joints than the arm's."""
+    n = loop.joints
+
+    def command(zeros):
+        reading = Reading(zeros, zeros)
+        reference = Reference(zeros, zeros, zeros, zeros)
+        law = loop.controller
+        return law.command(reading, reference, law.initial_state(reading), jnp.outer(zeros, zeros))
+
+    who = f"{type(loop.controller).__name__} of {loop.name}"
+    try:
+        shape = jax.eval_shape(command, jnp.zeros(n)).shape
+    except JaxidError:
+        raise
+    except (TypeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise ModelError(f"{who} has no torque for {n} joints, give all gains: {reason}") from error
+    if shape != (n,):
+        raise ModelError(f"{who} commands torques of shape {shape}, where there are {n} joints")
+
+
+def _check_noise(noise: Sequence[np.ndarray], recordings: Recordings | Sequence[Recording]) -> None:
+    if len(noise) != len(recordings):
+        raise RecordingError(f"noise is given for {len(noise)} of {len(recordings)} recordings")
+    for k, recording in enumerate(recordings):
+        if np.shape(noise[k]) != recording.q.shape:
+            raise RecordingError(
+                f"noise of shape {np.shape(noise[k])} is given for {recording.name}, whose "
+                f"positions have {recording.q.shape}"
+            )
+
+
+def prepare(
+    loop: ClosedLoop,
+    recordings: Recordings | Sequence[Recording],
+    noise: Sequence[np.ndarray] | None = None,
+) -> Batch:
+    """Recordings as one batch for a loop.
+
+    **Arguments:**
+
+    - `loop`: which controller, and how to interpolate.
+    - `recordings`: with as many joints as the loop.
+    - `noise`: added to what the sensors read, `(samples, joints)` for each recording.
+
+    **Raises:** `RecordingError` where the joints do not match, `ModelError` from the controller.
+    """
+    check_joints(loop, recordings[0])
+    if noise is not None:
+        _check_noise(noise, recordings)
+    period = loop.controller.period
+    grids = [_grid(r, period) for r in recordings]
+    length = max(len(grid) for grid, _ in grids)
+    samples = max(r.samples for r in recordings)
+    noises = [None] * len(recordings) if noise is None else list(noise)
+    rows = [
+        _drive(loop, r, g, length, e) for r, g, e in zip(recordings, grids, noises, strict=True)
+    ]
+    fields = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+    # The structure is that of one interval; the values are where they belong already.
+    one = Interval(*jax.device_put(jax.tree.map(lambda leaf: leaf[0, 0], fields)))
+    leaves = jax.tree.leaves(jax.device_put(fields))
+    intervals = jax.tree.unflatten(jax.tree.structure(one), leaves)
+    on_grid = all(len(grid) == r.samples for r, (grid, _) in zip(recordings, grids, strict=True))
+    starts = [(r.q[0], np.zeros(loop.joints)) if at_rest(r) else start_of(r) for r in recordings]
+    band = band_of(loop, recordings)
+    if band is not None:
+        starts = list(np.asarray(intervals.reference[:, 0, :2]))
+
+    def stack(pick) -> Array:
+        pieces = [pick(k, r) for k, r in enumerate(recordings)]
+        pads = [np.repeat(p[-1:], samples - len(p), axis=0) for p in pieces]
+        return jax.device_put(
+            np.stack([np.concatenate(both) for both in zip(pieces, pads, strict=True)])
+        )
+
+    return Batch(
+        intervals,
+        None if on_grid else stack(lambda k, r: np.searchsorted(grids[k][0], r.time)),
+        jax.device_put(np.arange(samples) < np.array([[r.samples] for r in recordings])),
+        jax.device_put(np.stack([q for q, _ in starts])),
+        jax.device_put(np.stack([v for _, v in starts])),
+        stack(lambda k, r: r.time),
+        stack(lambda k, r: r.q),
+        stack(lambda k, r: r.tau),
+        band,
+    )
+
+
+def band_of(loop: ClosedLoop, recordings: Recordings | Sequence[Recording]) -> Band | None:
+    """The part of the recordings' signals that the controller lets compare; None for all."""
+    cutoffs = [loop.controller.comparable(r) for r in recordings]
+    given = [c for c in cutoffs if c is not None]
+    if len(given) < len(cutoffs):
+        return None
+    return Band.of(list(recordings), given, max(r.samples for r in recordings))
+
+
+def compared(
+    loop: ClosedLoop,
+    recordings: Recordings | Sequence[Recording],
+    signals: Sequence[Float[np.ndarray, "_samples joints"]],
+) -> list[Float[np.ndarray, "_samples joints"]]:
+    """What of signals the controller lets compare, `(samples, joints)` for each recording.
+
+    **Arguments:**
+
+    - `signals`: one for each recording, `(samples, joints)`.
+    """
+    band = band_of(loop, recordings)
+    if band is None:
+        return list(signals)
+    longest = band.keep.shape[1]
+    padded = np.stack([np.pad(x, ((0, longest - len(x)), (0, 0))) for x in signals])
+    passed, keep = np.asarray(band(jnp.asarray(padded))), np.asarray(band.keep)
+    return [x[kept] for x, kept in zip(passed, keep, strict=True)]

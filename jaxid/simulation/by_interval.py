@@ -1,0 +1,266 @@
+"""Solvers and step-size controllers that go from interval to interval between samples.
+
+Time is counted in intervals: from 0 where the first begins to the number of intervals. What drives
+the loop may have a kink or a jump from one to the next, so no step goes across; and it is looked up
+without a search.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+from .batch import Interval
+
+Time = Float[Array, ""]
+Scalars = tuple[Float[Array, ""], ...]
+
+
+# A flat state, `(states,)`, alone or with its tangents, `(states, columns)`; and the same row by
+# row, so that what is computed of a state is computed of scalars.
+Rows = PyTree[Float[Array, "..."]]
+Rate = Callable[[Interval, Float[Array, ""], Rows], Rows]
+
+
+def apart(y: PyTree[Array]) -> Rows:
+    """A state row by row."""
+    return jax.tree.map(tuple, y)
+
+
+def together(rows: Rows, like: PyTree[Array]) -> PyTree[Array]:
+    """Rows as a state like another."""
+    kind = jax.tree.structure(like)
+    return jax.tree.unflatten(kind, [jnp.stack(leaf) for leaf in kind.flatten_up_to(rows)])
+
+
+def one_of(intervals: Interval, k: Int[Array, ""]) -> Interval:
+    """One of several intervals."""
+    return jax.tree.map(lambda leaf: leaf[k], intervals)
+
+
+# --- solvers ------------------------------------------------------------------------------------
+
+
+class Window(eqx.Module):
+    """Intervals in a row, from the one with number `first` on; leaves have `(intervals,)` first."""
+
+    intervals: Interval
+    first: int | Int[Array, ""] = 0
+
+    def at(self, t: Any) -> "Window":
+        """The one interval at a time; beyond the ends that at the end."""
+        count = self.intervals.h.shape[0]
+        if count == 1:
+            return self
+        number = jnp.clip(jnp.floor(t).astype(int) - self.first, 0, count - 1)
+        alone = jax.tree.map(lambda leaf: leaf[None], one_of(self.intervals, number))
+        return Window(alone, self.first + number)
+
+
+class WithinIntervals(diffrax.AbstractSolver):
+    """A solver all stages of whose steps are of the interval in which the step begins.
+
+    A stage may lie at the end of a step or, with some methods, beyond it.
+    """
+
+    solver: diffrax.AbstractSolver
+
+    @property
+    def term_structure(self):
+        """Of the solver."""
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self):
+        """Of the solver."""
+        return self.solver.interpolation_cls
+
+    def order(self, terms):
+        """Of the solver."""
+        return self.solver.order(terms)
+
+    def error_order(self, terms):
+        """Of the solver."""
+        return self.solver.error_order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        """Of the solver."""
+        return self.solver.init(terms, t0, t1, y0, args.at(t0))
+
+    def func(self, terms, t0, y0, args):
+        """The vector field."""
+        return self.solver.func(terms, t0, y0, args)
+
+    def step(self, terms, t0: Any, t1: Any, y0, args, solver_state, made_jump):
+        """A step of the solver."""
+        return self.solver.step(terms, t0, t1, y0, args.at(t0), solver_state, made_jump)
+
+
+class ThroughIntervals(diffrax.AbstractSolver):
+    """RK4 whose step is a whole interval: what drives the loop is looked up once for all of it.
+
+    Within, the state is taken apart, and time is in seconds.
+    """
+
+    method: Any
+    rate: Rate
+    substeps: int | Int[Array, ""]
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def order(self, terms) -> int:
+        """Of the method."""
+        return self.method.order(terms)
+
+    def init(self, terms, t0, t1, y0, args) -> None:
+        """It keeps nothing between steps."""
+        return None
+
+    def func(self, terms, t0, y0, args):
+        """The vector field."""
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms, t0: Any, t1: Any, y0, args, solver_state, made_jump):
+        """Through one interval."""
+        interval = one_of(args.at(t0).intervals, jnp.asarray(0))
+        dt = interval.h / self.substeps
+        inside = diffrax.ODETerm(lambda t, y, args: self.rate(interval, jnp.asarray(t), y))
+
+        def substep(k, y):
+            start = interval.t0 + k * dt
+            return self.method.step(inside, start, start + dt, y, None, None, False)[0]
+
+        rows = apart(y0)
+        if not isinstance(self.substeps, int):
+            rows = jax.lax.fori_loop(0, self.substeps, substep, rows)
+        elif self.substeps == 1:
+            rows = substep(0, rows)
+        else:
+            numbers = jnp.arange(self.substeps)
+            rows, _ = jax.lax.scan(lambda y, k: (substep(k, y), None), rows, numbers)
+        y1 = together(rows, y0)
+        return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
+
+
+# --- controllers --------------------------------------------------------------------------------
+
+
+class OneStep(diffrax.AbstractStepSizeController):
+    """One step for each interval."""
+
+    def wrap(self, direction):
+        """Time runs forward only."""
+        return self
+
+    def init(self, terms, t0: Any, t1: Any, y0, dt0, args, func, error_order):
+        """The end of the first step."""
+        return t0 + 1, None
+
+    def adapt_step_size(
+        self, t0: Any, t1: Any, y0, y1_candidate, args, y_error, error_order, state
+    ):
+        """The next step."""
+        return True, t1, t1 + 1, False, None, diffrax.RESULTS.successful
+
+
+class EqualSteps(diffrax.AbstractStepSizeController):
+    """Equal steps through each interval.
+
+    **Arguments:**
+
+    - `count`: how many for each.
+    """
+
+    count: int | Int[Array, ""]
+
+    def wrap(self, direction):
+        """Time runs forward only."""
+        return self
+
+    def init(self, terms, t0: Any, t1: Any, y0, dt0, args, func, error_order):
+        """The end of the first step."""
+        first = jnp.asarray(1)
+        return first / self.count, first
+
+    def adapt_step_size(
+        self, t0: Any, t1: Any, y0, y1_candidate, args, y_error, error_order, state
+    ):
+        """The next step."""
+        # As after a jump, so that no solver takes over a slope from another interval.
+        end = (state + 1) / self.count
+        return True, t1, end, True, state + 1, diffrax.RESULTS.successful
+
+
+class CutSteps(diffrax.AbstractAdaptiveStepSizeController):
+    """Another controller's steps, cut where an interval ends.
+
+    **Arguments:**
+
+    - `control`: the other, which thinks in seconds.
+    - `start`, `length`: of the intervals, s; `length` is positive.
+    - `first`: length of the first step that is tried, s.
+    """
+
+    control: diffrax.AbstractAdaptiveStepSizeController
+    start: Float[Array, " intervals"]
+    length: Float[Array, " intervals"]
+    first: Any
+
+    @property
+    def rtol(self):
+        """Of the other, from which an implicit solver takes it."""
+        return self.control.rtol
+
+    @property
+    def atol(self):
+        """Of the other."""
+        return self.control.atol
+
+    @property
+    def norm(self):
+        """Of the other."""
+        return self.control.norm
+
+    def wrap(self, direction):
+        """The same around the other as diffrax wraps it; time runs forward only."""
+        return dataclasses.replace(self, control=self.control.wrap(direction))
+
+    def _seconds(self, t: Time, interval: Int[Array, ""]) -> Time:
+        return self.start[interval] + (t - interval) * self.length[interval]
+
+    def _within(self, t: Any, step: Any, interval: Int[Array, ""]) -> Time:
+        """The end of a step of some seconds that begins at `t`."""
+        after = jnp.maximum(t + step / self.length[interval], jnp.nextafter(t, jnp.inf))
+        return jnp.minimum(after, (interval + 1).astype(t.dtype))
+
+    def init(self, terms, t0: Any, t1: Any, y0, dt0, args, func, error_order):
+        """The end of the first step, and the other's state."""
+        begin, end = self.start[0], self.start[-1] + self.length[-1]
+        then, state = self.control.init(terms, begin, end, y0, self.first, args, func, error_order)
+        return self._within(t0, then - begin, jnp.asarray(0)), state
+
+    def adapt_step_size(
+        self, t0: Any, t1: Any, y0, y1_candidate, args, y_error, error_order, state
+    ):
+        """Whether to keep the step, and the next one."""
+        last = self.start.shape[0] - 1
+        now = jnp.clip(jnp.floor(t0).astype(int), 0, last)
+        keep, begin, end, jump, state, result = self.control.adapt_step_size(
+            self._seconds(t0, now),
+            self._seconds(t1, now),
+            y0,
+            y1_candidate,
+            args,
+            y_error,
+            error_order,
+            state,
+        )
+        over = keep & (t1 >= (now + 1).astype(t1.dtype))
+        following = jnp.where(over, jnp.minimum(now + 1, last), now)
+        start = jnp.where(keep, t1, t0)
+        return keep, start, self._within(start, end - begin, following), over | jump, state, result

@@ -1,0 +1,318 @@
+"""The equations of motion of a closed loop, and its state."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from ..control import Reading, Reference
+from ..effects import AbstractEffect, AbstractTransmission, Motion
+from .loop import ClosedLoop
+
+
+class State(eqx.Module):
+    """The loop's state: drive positions and velocities, the effects' states, the controller's."""
+
+    q: Float[Array, " joints"]
+    v: Float[Array, " joints"]
+    effects: tuple[Float[Array, " _"], ...]
+    controller: Float[Array, " states"]
+
+
+def rest(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> State:
+    """The state at a position and velocity, `(joints,)`, with all else at rest."""
+    effects = tuple(effect.initial_state() for effect in loop.effects)
+    return State(q, v, effects, loop.controller.initial_state(read(loop, q, v)))
+
+
+def settle(
+    loop: ClosedLoop,
+    t: Float[Array, ""],
+    state: State,
+    reference: Reference,
+    label: Int[Array, ""],
+) -> State:
+    """The state with the effects' own parts as the first command finds them: none ramps up."""
+    seen = read(loop, state.q, state.v)
+    mass = loop.arm.mass_matrix(state.q)
+    tau = loop.controller.command(seen, reference, state.controller, mass)
+    motion = Motion(t, state.q, state.v, jnp.zeros_like(state.q), tau, jnp.zeros(0), label)
+    settled = []
+    for effect in loop.effects:
+        own = effect.settled(motion)
+        settled.append(own)
+        motion = dataclasses.replace(
+            motion, tau=effect.command(dataclasses.replace(motion, state=own))
+        )
+    return dataclasses.replace(state, effects=tuple(settled))
+
+
+def _sensor(loop: ClosedLoop, q: Float[Array, " joints"]) -> Float[Array, " joints"]:
+    """What sensors without steps report, `(joints,)`."""
+    for effect in loop.effects:
+        q = effect.read(q)
+    return q
+
+
+def read(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Reading:
+    """What the sensors report at a position and velocity, `(joints,)`."""
+    seen, rate = jax.jvp(lambda position: _sensor(loop, position), (q,), (v,))
+    if loop.resolution is not None:
+        step = jnp.asarray(loop.resolution)
+        # Rounding has no slope; sensitivities go through as if the encoder were ideal.
+        seen = seen + jax.lax.stop_gradient(step * jnp.round(seen / step) - seen)
+    return Reading(seen, rate)
+
+
+def behind(
+    loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]
+) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
+    """Position and velocity at which the sensors report these, `(joints,)` each."""
+    if all(type(effect).read is AbstractEffect.read for effect in loop.effects):
+        return q, v
+
+    def position(reading: Float[Array, " joints"]) -> Float[Array, " joints"]:
+        guess = reading
+        # Errors of sensors are some hundredths of what they read: each turn gains two digits.
+        for _ in range(6):
+            guess = guess + reading - _sensor(loop, guess)
+        return guess
+
+    return jax.jvp(position, (q,), (v,))
+
+
+def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solves a small positive-definite system, unrolled: LAPACK's call costs more than the sums."""
+    n = right.shape[0]
+    rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
+    b = [right[i] for i in range(n)]
+    for k in range(n):
+        for i in range(k + 1, n):
+            factor = rows[i][k] / rows[k][k]
+            rows[i] = [rows[i][j] - factor * rows[k][j] for j in range(n)]
+            b[i] = b[i] - factor * b[k]
+    x: list[Float[Array, ""]] = [b[0]] * n
+    for i in reversed(range(n)):
+        rest_of_row = sum((rows[i][j] * x[j] for j in range(i + 1, n)), jnp.zeros(()))
+        x[i] = (b[i] - rest_of_row) / rows[i][i]
+    return jnp.stack(x)
+
+
+class Outside(eqx.Module):
+    """What comes from outside the loop at one instant; vectors are `(joints,)`.
+
+    `push` is torque on the drives, `pull` on the links (the same where nothing gives way between
+    them and nothing depends on the load), `noise` is added to what the sensors read.
+    """
+
+    push: Float[Array, " joints"]
+    pull: Float[Array, " joints"]
+    noise: Reading
+
+
+class Instant(eqx.Module):
+    """Everything about one instant of the loop; vectors are `(joints,)`.
+
+    `command` is what the controller asks for and what gets recorded, `tau` what the drives
+    deliver, `a` the acceleration of the drives.
+    """
+
+    reading: Reading
+    command: Float[Array, " joints"]
+    tau: Float[Array, " joints"]
+    a: Float[Array, " joints"]
+    derivative: State
+
+
+def effect_loads(
+    loop: ClosedLoop,
+    motion: Motion,
+    states: tuple[Float[Array, " _"], ...],
+    links: Motion | None = None,
+    *,
+    push: Float[Array, " joints"] | float = 0.0,
+    curves: bool = True,
+    inertia: bool = True,
+) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
+    """Torque that all effects together ask of the drives, and that of the links, `(joints,)` each.
+
+    Effects of the load come last, since they are given what the others leave of the torque; what
+    is proportional to acceleration, which is solved for, is not taken off it.
+
+    **Arguments:**
+
+    - `motion`: of the drives. `states`: the effects' own. `links`: their motion, where they part
+      from the drives.
+    - `push`: torque on the drives from outside, which effects of the load see.
+    - `curves`: False to leave out what needs an acceleration that is not known yet.
+    - `inertia`: False to leave out what is proportional to acceleration.
+    """
+    drive = link = ahead = jnp.zeros_like(motion.v)
+    behind = motion if links is None else links
+    own = [
+        (effect, state)
+        for effect, state in zip(loop.effects, states, strict=True)
+        if curves or not effect.needs_acceleration
+    ]
+    for effect, state in own:
+        if effect.loaded:
+            continue
+        seen = dataclasses.replace(behind if effect.on_link else motion, state=state)
+        if effect.inertial and not inertia:
+            seen = dataclasses.replace(seen, a=jnp.zeros_like(seen.a))
+        torque = effect.torque(seen)
+        if effect.on_link:
+            link = link + torque
+            continue
+        drive = drive + torque
+        if effect.inertial:
+            torque = effect.torque(dataclasses.replace(seen, a=jnp.zeros_like(seen.a)))
+        ahead = ahead + torque
+    left = dataclasses.replace(motion, tau=motion.tau - ahead + push)
+    for effect, state in own:
+        if effect.loaded:
+            drive = drive + effect.torque(dataclasses.replace(left, state=state))
+    return drive, link
+
+
+def inverse(
+    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...]
+) -> Float[Array, " joints"]:
+    """Torque at the joints that a motion takes (the inverse dynamic model), `(joints,)`."""
+    rigid = loop.arm.mass_matrix(motion.q) @ motion.a + loop.arm.bias(motion.q, motion.v)
+    drive, link = effect_loads(loop, motion, states)
+    return rigid + drive + link
+
+
+def _added_inertia(
+    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...]
+) -> Float[Array, "joints joints"]:
+    n = loop.joints
+    inertial = [(e, s) for e, s in zip(loop.effects, states, strict=True) if e.inertial]
+    if not inertial:
+        return jnp.zeros((n, n))
+
+    def torque(a: Float[Array, " joints"]) -> Float[Array, " joints"]:
+        at = dataclasses.replace(motion, a=a)
+        pieces = [e.torque(dataclasses.replace(at, state=s)) for e, s in inertial]
+        return sum(pieces[1:], pieces[0])
+
+    return jax.jacfwd(torque)(motion.a)
+
+
+def instant(
+    loop: ClosedLoop,
+    t: Float[Array, ""],
+    state: State,
+    reference: Reference,
+    outside: Outside,
+    label: Int[Array, ""],
+) -> Instant:
+    """The closed loop at one instant: what is read, commanded and delivered, and what follows.
+
+    **Arguments:**
+
+    - `t`: time, s.
+    - `state`: of the loop.
+    - `reference`: what the controller is asked for.
+    - `outside`: what acts on it.
+    - `label`: which recording.
+    """
+    seen = read(loop, state.q, state.v)
+    seen = Reading(seen.q + outside.noise.q, seen.v + outside.noise.v)
+    mass = loop.arm.mass_matrix(state.q)
+    command = loop.controller.command(seen, reference, state.controller, mass)
+    tau = loop.controller.acting(command, state.controller)
+    motion = Motion(t, state.q, state.v, jnp.zeros_like(state.q), tau, jnp.zeros(0), label)
+    # An effect's own states see what arrives at it, so that lags in a row compose.
+    arriving = []
+    for effect, own in zip(loop.effects, state.effects, strict=True):
+        arriving.append(motion.tau)
+        seen_by = dataclasses.replace(motion, state=own)
+        motion = dataclasses.replace(motion, tau=effect.command(seen_by))
+    a, twisting = _accelerations(loop, motion, state, outside)
+    rates = []
+    for k, (effect, own) in enumerate(zip(loop.effects, state.effects, strict=True)):
+        if k in twisting:
+            rates.append(jnp.stack([own[1], twisting[k]]))
+        else:
+            at = dataclasses.replace(motion, a=a, tau=arriving[k], state=own)
+            rates.append(effect.derivative(at))
+    law = loop.controller.derivative(seen, reference, state.controller)
+    return Instant(seen, command, motion.tau, a, State(state.v, a, tuple(rates), law))
+
+
+def _accelerations(
+    loop: ClosedLoop, motion: Motion, state: State, outside: Outside
+) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
+    """Accelerations of the drives, and of the twist of each transmission by its place."""
+    added = _added_inertia(loop, motion, state.effects)
+    matrix = loop.arm.mass_matrix(state.q) + added
+    bias = loop.arm.bias(state.q, state.v)
+    own = state.effects
+    if any(effect.needs_acceleration for effect in loop.effects):
+        drive, link = effect_loads(loop, motion, own, push=outside.push, curves=False)
+        without = motion.tau - drive - link + outside.push + outside.pull
+        motion = dataclasses.replace(motion, a=solve_positive(matrix, without - bias))
+    transmissions = [
+        (k, e) for k, e in enumerate(loop.effects) if isinstance(e, AbstractTransmission)
+    ]
+    if transmissions:
+        return _through_transmissions(loop, motion, state, transmissions, outside, added)
+    # What is proportional to acceleration is on the left-hand side already.
+    drive, link = effect_loads(loop, motion, own, push=outside.push, inertia=False)
+    torque = motion.tau - drive - link + outside.push + outside.pull
+    return solve_positive(matrix, torque - bias), {}
+
+
+def _through_transmissions(
+    loop: ClosedLoop,
+    motion: Motion,
+    state: State,
+    transmissions: list[tuple[int, AbstractTransmission]],
+    outside: Outside,
+    added: Float[Array, "joints joints"],
+) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
+    """Rotors on the drive's side, the rest of the inertia on the link's (Spong 1987)."""
+    q, v = state.q, state.v
+    rotors = passed = jnp.zeros_like(q)
+    apart = jnp.zeros_like(q, bool)
+    for k, transmission in transmissions:
+        j, there = transmission.joint - 1, transmission.present()
+        twist, rate = jnp.where(there, state.effects[k], 0.0)
+        q, v = q.at[j].add(twist), v.at[j].add(rate)
+        passed = passed.at[j].set(transmission.through(twist, rate))
+        apart = apart.at[j].set(there)
+        rotors = rotors.at[j].set(jnp.where(there, transmission.rotor, 0.0))
+    links = dataclasses.replace(motion, q=q, v=v)
+    drive, held = effect_loads(loop, motion, state.effects, links, push=outside.push, inertia=False)
+    available = motion.tau - drive + outside.push
+    on_link = jnp.where(apart, passed, available)
+    matrix = loop.arm.mass_matrix(q) + added - jnp.diag(rotors)
+    reaching = on_link - held + outside.pull
+    link = solve_positive(matrix, reaching - loop.arm.bias(q, v))
+    a, twisting = link, {}
+    for k, transmission in transmissions:
+        j, there = transmission.joint - 1, transmission.present()
+        turned = (available[j] - on_link[j]) / transmission.rotor
+        a = a.at[j].set(jnp.where(there, turned, link[j]))
+        twisting[k] = jnp.where(there, link[j] - turned, 0.0)
+    return a, twisting
+
+
+def sizes(loop: ClosedLoop) -> list[int]:
+    """Lengths of the parts of a state: q, v, each effect's, the controller's."""
+    zeros = jnp.zeros(loop.joints)
+    parts = jax.eval_shape(lambda: rest(loop, zeros, zeros))
+    return [math.prod(leaf.shape) for leaf in jax.tree.leaves(parts)]
+
+
+def unflatten(loop: ClosedLoop) -> Callable[[Float[Array, " states"]], State]:
+    """The function that makes a state of a flat vector, `(states,)`."""
+    zeros = jnp.zeros(loop.joints)
+    return ravel_pytree(rest(loop, zeros, zeros))[1]

@@ -1,0 +1,302 @@
+"""A loop through the intervals of a recording, by diffrax.
+
+Time is counted in intervals here (see `by_interval`), so that what drives the loop is looked up
+without a search, and intervals of no length, which pad recordings, leave the state alone.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from ..control import Reading, Reference
+from .batch import Interval
+from .by_interval import (
+    CutSteps,
+    EqualSteps,
+    OneStep,
+    Rate,
+    Scalars,
+    ThroughIntervals,
+    Window,
+    WithinIntervals,
+    apart,
+    one_of,
+    together,
+)
+from .dynamics import Instant, Outside, State, behind, instant, rest, settle, unflatten
+from .loop import ClosedLoop
+from .stepping import ready
+from .unrolling import unrolled
+
+SIGNALS = ("tau", "q", "v", "a", "delivered")
+
+
+# --- one instant --------------------------------------------------------------------------------
+
+
+def _line(ends: Float[Array, "2 joints"] | None, dt, h, joints: int) -> Float[Array, " joints"]:
+    """A line between its two ends, after a time from the first."""
+    if ends is None:
+        return jnp.zeros(joints)
+    return ends[0] + dt * (ends[1] - ends[0]) / jnp.where(h > 0, h, 1.0)
+
+
+def _reference(interval: Interval, dt: Float[Array, ""]) -> Reference:
+    c0, c1, c2, c3 = interval.reference
+    q = c0 + dt * (c1 + dt * (c2 + dt * c3))
+    v = c1 + dt * (2 * c2 + 3 * dt * c3)
+    a = 2 * c2 + 6 * dt * c3
+    return Reference(q, v, a, interval.torque[0] + dt * interval.torque[1])
+
+
+def instant_at(loop: ClosedLoop, interval: Interval, t: Float[Array, ""], state: State) -> Instant:
+    """The loop at a time within an interval, s."""
+    dt = t - interval.t0
+    noise, rate, push, pull = (
+        _line(ends, dt, interval.h, loop.joints)
+        for ends in (interval.noise, interval.rate, interval.push, interval.pull)
+    )
+    outside = Outside(push, pull, Reading(noise, rate))
+    return instant(loop, t, state, _reference(interval, dt), outside, interval.label)
+
+
+def initial(
+    loop: ClosedLoop,
+    intervals: Interval,
+    q: Float[Array, " joints"],
+    v: Float[Array, " joints"],
+) -> Float[Array, " states"]:
+    """The flat state at the start of a run, `(states,)`, at measured position and velocity."""
+    first = jax.tree.map(lambda leaf: leaf[0], intervals)
+    reference = _reference(first, jnp.zeros(()))
+    start = rest(loop, *behind(loop, q, v))
+    return ravel_pytree(settle(loop, first.t0, start, reference, first.label))[0]
+
+
+def observe(
+    loop: ClosedLoop, interval: Interval, x: Float[Array, " states"], rows: tuple[int, ...]
+) -> tuple[Float[Array, " states"], Float[Array, "rows joints"]]:
+    """The start of an interval: the state once a sampled law has ticked, and rows of `SIGNALS`."""
+    unravel = unflatten(loop)
+
+    def begin(interval: Interval, x: Float[Array, " states"]):
+        state = unravel(x)
+        if loop.controller.period is not None:
+            now = instant_at(loop, interval, interval.t0, state)
+            asked = _reference(interval, jnp.zeros(()))
+            ticked = loop.controller.tick(now.reading, asked, state.controller)
+            held = jnp.where(interval.tick, ticked, state.controller)
+            state = dataclasses.replace(state, controller=held)
+        now = instant_at(loop, interval, interval.t0, state)
+        seen = (now.command, now.reading.q, now.reading.v, now.a, now.tau)
+        return ravel_pytree(state)[0], jnp.stack([seen[row] for row in rows])
+
+    return unrolled(begin, interval, x)(interval, x)
+
+
+# --- one solve ----------------------------------------------------------------------------------
+
+
+def _rate(loop: ClosedLoop, intervals: Interval, x: Float[Array, " states"]) -> Rate:
+    """The loop's equations, 1/s, written out: of an interval, a time within it and a state."""
+    unravel = unflatten(loop)
+
+    def rate(interval: Interval, t: Float[Array, ""], y: Scalars) -> Scalars:
+        derivative = instant_at(loop, interval, t, unravel(jnp.stack(y))).derivative
+        return tuple(ravel_pytree(derivative)[0])
+
+    first = one_of(intervals, jnp.asarray(0))
+    return unrolled(rate, first, first.t0, tuple(x))
+
+
+def with_tangents(
+    fun: Callable[..., Any], loop: ClosedLoop, columns: int
+) -> Callable[..., tuple[Any, Any]]:
+    """A function of a loop and a state, with its derivatives: of a state and its tangents.
+
+    **Arguments:**
+
+    - `fun`: of a loop with some parameters and a state.
+    - `columns`: tangents; the first are by the loop's free parameters.
+    """
+    theta = loop.theta
+    directions = jnp.eye(theta.shape[0], columns)
+
+    def both(x, tangents):
+        def along(d_theta, d_x):
+            return jax.jvp(lambda at, x: fun(loop.with_theta(at), x), (theta, x), (d_theta, d_x))
+
+        return jax.vmap(along, in_axes=(1, -1), out_axes=(None, -1))(directions, tangents)
+
+    return both
+
+
+def _solve(
+    loop: ClosedLoop,
+    rate: Rate,
+    intervals: Interval,
+    y0: PyTree[Array],
+    saveat: diffrax.SaveAt,
+    substeps: int | Int[Array, ""] | None = None,
+    stop: float | Float[Array, ""] | None = None,
+) -> diffrax.Solution:
+    """From the start of the first interval to the end of the last; `stop` for an earlier end."""
+    stepping, count = loop.stepping, intervals.h.shape[0]
+    substeps = _substeps(loop, substeps)
+
+    def field(t, y, window):
+        window = window.at(t)
+        now = one_of(window.intervals, jnp.asarray(0))
+        slope = together(rate(now, now.t0 + (t - window.first) * now.h, apart(y)), y)
+        return jax.tree.map(lambda leaf: now.h * leaf, slope)
+
+    made_jump, most = None, count
+    control = stepping.control
+    if stepping.plain:
+        solver, steps = ThroughIntervals(stepping.solver, rate, substeps), OneStep()
+    elif control is None:
+        solver, steps = WithinIntervals(ready(stepping)), EqualSteps(substeps)
+        made_jump, most = True, substeps * count if isinstance(substeps, int) else None
+    else:
+        solver = WithinIntervals(ready(stepping))
+        length = jnp.where(intervals.h > 0, intervals.h, 1.0)
+        first = length[0] / substeps
+        steps: Any = CutSteps(control, intervals.t0, length, first)  # type: ignore[reportCallIssue]
+        most = stepping.max_steps * count
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        solver,
+        0.0,
+        float(count) if stop is None else stop,
+        None,
+        y0,
+        Window(intervals),
+        saveat=saveat,
+        stepsize_controller=steps,
+        adjoint=stepping.adjoint,
+        max_steps=most,
+        made_jump=made_jump,
+        throw=False,
+    )
+
+
+def integrate(
+    loop: ClosedLoop,
+    intervals: Interval,
+    x0: Float[Array, " states"],
+    substeps: int | Int[Array, ""] | None = None,
+) -> tuple[Float[Array, "points states"], Int[Array, ""]]:
+    """One solve through all intervals: the states at grid points, and how it ended.
+
+    From where a solve fails on, states are infinite.
+
+    **Arguments:**
+
+    - `intervals`: between grid points; the last, which has no length, ends the run.
+    - `substeps`: in place of the settings' own, for programs that serve any number of them.
+    """
+    through = jax.tree.map(lambda leaf: leaf[:-1], intervals)
+    rate = _rate(loop, through, x0)
+    if loop.stepping.plain:
+        return _at_steps(loop, rate, through, x0, substeps), success()
+    saveat = diffrax.SaveAt(ts=jnp.arange(float(intervals.h.shape[0])))
+    solution = _solve(loop, rate, through, x0, saveat, substeps)
+    assert solution.ys is not None
+    return solution.ys, _number(solution.result)
+
+
+def integrate_with_tangents(
+    loop: ClosedLoop,
+    intervals: Interval,
+    x0: Float[Array, " states"],
+    start: Float[Array, "states columns"],
+) -> tuple[Float[Array, "points states"], Float[Array, "points states columns"]]:
+    """`integrate` with the derivative of every state, for RK4 with fixed steps.
+
+    The sensitivity equations go through RK4 beside the state. For fixed steps that is the exact
+    derivative of the discrete run, as forward mode through the solve gives it, and takes half as
+    long to trace: forward mode and `vmap` would each go through all of diffrax again.
+    """
+    through = jax.tree.map(lambda leaf: leaf[:-1], intervals)
+
+    # As a part of its own, since diffrax traces a step several times.
+    @jax.jit
+    def rate(interval, t, rows):
+        def plain(loop, x):
+            return _rate(loop, through, x0)(interval, t, x)
+
+        return with_tangents(plain, loop, start.shape[1])(*rows)
+
+    return _at_steps(loop, rate, through, (x0, start))
+
+
+def _at_steps(loop, rate, through, y0, substeps=None):
+    """States at grid points where a step is an interval: no interpolation, and no step can fail."""
+    ys = _solve(loop, rate, through, y0, diffrax.SaveAt(steps=True), substeps).ys
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), y0, ys)
+
+
+def through_interval(
+    loop: ClosedLoop,
+    interval: Interval,
+    x: Float[Array, " states"],
+    substeps: int | Int[Array, ""] | None = None,
+    alive: Bool[Array, ""] | None = None,
+) -> tuple[Float[Array, " states"], Int[Array, ""]]:
+    """The state at an interval's end, not a number where the solve fails, and how it ended.
+
+    **Arguments:**
+
+    - `alive`: False where there is nothing left to solve.
+    """
+    alone = jax.tree.map(lambda leaf: leaf[None], interval)
+    rate = _rate(loop, alone, x)
+    if loop.stepping.plain:
+        # One step, which cannot fail: a solve around it would only take longer to compile.
+        count = _substeps(loop, substeps)
+        solver = ThroughIntervals(loop.stepping.solver, rate, count)
+        start = jnp.zeros(())
+        return solver.step(None, start, start + 1, x, Window(alone), None, False)[0], success()
+    stop = None
+    if alive is not None and loop.stepping.control is not None:
+        stop = jnp.where(alive, 1.0, 0.0)
+    solution = _solve(loop, rate, alone, x, diffrax.SaveAt(t1=True), substeps, stop)
+    code = _number(solution.result)
+    assert solution.ys is not None
+    return jnp.where(code == 0, solution.ys[0], jnp.nan), code
+
+
+def _substeps(loop: ClosedLoop, given: int | Int[Array, ""] | None) -> int | Int[Array, ""]:
+    return loop.stepping.substeps or 1 if given is None else given
+
+
+# --- how a solve ended --------------------------------------------------------------------------
+
+
+def success() -> Int[Array, ""]:
+    """The number of a result that is none of the reasons to fail."""
+    return jnp.zeros((), jnp.int32)
+
+
+def unless_finite(code: Int[Array, ""], values: Float[Array, "..."]) -> Int[Array, ""]:
+    """The number of a result, that of values which are not finite where nothing else is wrong."""
+    bad = ~jnp.all(jnp.isfinite(values))
+    return jnp.where((code == 0) & bad, _number(diffrax.RESULTS.nonfinite), code)
+
+
+def _number(result: Any) -> Int[Array, ""]:
+    (number,) = jax.tree.leaves(result)
+    return jnp.asarray(number, jnp.int32)
+
+
+def reason(code: int | np.integer | Int[Array | np.ndarray, ""]) -> str:
+    """Why a solve failed, in diffrax's words; empty where it did not."""
+    kind = jax.tree.structure(diffrax.RESULTS.successful)
+    return diffrax.RESULTS[jax.tree.unflatten(kind, [np.asarray(code)])]

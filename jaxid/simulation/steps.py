@@ -1,0 +1,201 @@
+"""How many steps a loop needs between two samples."""
+
+import dataclasses
+import math
+import warnings
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from ..compiling import compiled
+from ..control import Reading, Reference
+from ..errors import JaxidWarning, ModelError
+from ..recording import Recordings
+from .batch import NOBODY, check_joints
+from .dynamics import Outside, instant, rest, unflatten
+from .loop import ClosedLoop
+from .stepping import RK4
+
+# Steps between two samples above which a simulation is said to be slow, and refused.
+MANY, TOO_MANY = 64, 10_000
+
+
+def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
+    """The loop with the number of steps between samples settled, where the user left it open.
+
+    A step is at most 2.5 ms, and at most a quarter of the fastest time constant, met with friction
+    at its steepest, at standstill; and no step is so long that a bristle at speed runs away. Time
+    constants do not bind implicit solvers. A number settled before grows where an effect with
+    states of its own, added since, would. A step-size controller needs no number.
+
+    **Raises:** `ModelError` where more than 10 000 steps would be needed. More than 64 are taken,
+    and said in a `JaxidWarning`.
+    """
+    check_joints(loop, recordings[0])
+    before, settled = loop.stepping.substeps, loop.stepping.settled
+    if loop.stepping.control is not None or (
+        before is not None and not (settled and _has_states(loop))
+    ):
+        return loop
+    period = loop.controller.period
+    longest = max(r.period for r in recordings)
+    interval = longest if period is None else min(longest, period)
+    if isinstance(loop.stepping.solver, diffrax.AbstractImplicitSolver):
+        still, moving = 0.0, 0.0
+    else:
+        still, moving = _rates(loop, recordings)
+    if before is None:
+        # The torque of a stiff made-up law is wrong by about (pace · step)⁴ / 20.
+        pace = 7 * loop.controller.pace
+        rate = max(1 / 2.5e-3, still / 0.25, moving / 2, pace)
+    else:
+        rate = max(before / interval, still / 2, moving / 2)
+    return set_substeps(loop, steps_at(rate, interval, loop.name), settled=True)
+
+
+def steps_at(rate: float, interval: float, name: str) -> int:
+    """How many steps at a rate, 1/s, fill an interval, s.
+
+    **Arguments:**
+
+    - `name`: of the loop.
+
+    **Raises:** `ModelError` where they are too many; many are said in a `JaxidWarning`.
+    """
+    steps = max(math.ceil(interval * rate - 1e-9), 1)
+    said = (
+        f"{name} changes so fast, within {1 / rate:.2g} s, that it takes {steps} steps between two "
+        f"samples {interval:.3g} s apart"
+    )
+    if steps > TOO_MANY:
+        raise ModelError(
+            f"{said}, more than {TOO_MANY}: look for a parameter that makes it so stiff, or choose "
+            "an implicit solver, jaxid.Stepping(solver=diffrax.Kvaerno5(), control=...)"
+        )
+    if steps > MANY:
+        remedy = "a parameter may make it stiffer than it is, and an implicit solver needs fewer"
+        _say(f"{said}: {remedy} (jaxid.Stepping(solver=diffrax.Kvaerno5(), control=...))")
+    return steps
+
+
+def refined(steps: float, name: str) -> int:
+    """A number of steps that the error of fewer asks for; many are said in a `JaxidWarning`.
+
+    **Arguments:**
+
+    - `steps`: wanted between two samples; 10 000 are taken where it is more.
+    - `name`: of the loop.
+    """
+    taken = math.ceil(min(steps, TOO_MANY))
+    if taken > MANY:
+        error = "" if steps <= TOO_MANY else f", where its error asks for {steps:.3g}"
+        _say(
+            f"{name} is integrated with {taken} steps between two samples{error}: a solver of "
+            "higher order or with a controller needs fewer (jaxid.Stepping)"
+        )
+    return taken
+
+
+def _say(what: str) -> None:
+    warnings.warn(what, JaxidWarning, stacklevel=2)
+
+
+def set_substeps(loop: ClosedLoop, substeps: int | None, settled: bool = False) -> ClosedLoop:
+    """The loop with that many steps between two grid points.
+
+    **Arguments:**
+
+    - `settled`: whether it is jaxid that has chosen them.
+    """
+    stepping = dataclasses.replace(loop.stepping, substeps=substeps, settled=settled)
+    return dataclasses.replace(loop, stepping=stepping)
+
+
+def _has_states(loop: ClosedLoop) -> bool:
+    return any(effect.initial_state().size for effect in loop.effects)
+
+
+def with_rolled_stages(loop: ClosedLoop) -> ClosedLoop:
+    """The loop with the stages of its steps in a loop: for derivatives, and for many settings.
+
+    Written out, as a lone simulation likes them best, four stages of all tangents are more than
+    the registers and first cache of a core hold: half as fast, and longer to compile.
+    """
+    solver = loop.stepping.solver
+    if not isinstance(solver, RK4):
+        return loop
+    rolled = dataclasses.replace(solver, rolled=True)
+    stepping = dataclasses.replace(loop.stepping, solver=rolled)
+    return dataclasses.replace(loop, stepping=stepping)
+
+
+def with_forward_mode(loop: ClosedLoop) -> ClosedLoop:
+    """The loop with an adjoint that knows forward mode, where its own knows reverse mode alone."""
+    if isinstance(loop.stepping.adjoint, diffrax.ForwardMode | diffrax.DirectAdjoint):
+        return loop
+    stepping = dataclasses.replace(loop.stepping, adjoint=diffrax.ForwardMode())
+    return dataclasses.replace(loop, stepping=stepping)
+
+
+def with_reverse_mode(loop: ClosedLoop, points: int) -> ClosedLoop:
+    """The loop with an adjoint by which its sensitivities can be differentiated backwards.
+
+    **Arguments:**
+
+    - `points`: of the grid; as many states are kept, so that none is computed twice.
+    """
+    if loop.stepping.plain:
+        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=points)
+    else:
+        adjoint = diffrax.DirectAdjoint()
+    stepping = dataclasses.replace(loop.stepping, adjoint=adjoint)
+    return dataclasses.replace(loop, stepping=stepping)
+
+
+def fastest_rate(loop: ClosedLoop, recordings: Recordings) -> float:
+    """Largest eigenvalue of the loop's equations at standstill along the recordings, 1/s."""
+    return _rates(loop, recordings)[0]
+
+
+def _rates(loop: ClosedLoop, recordings: Recordings) -> tuple[float, float]:
+    """Largest eigenvalues at standstill, and as fast as recordings get over ten samples, 1/s."""
+    still = np.concatenate([r.q[:: max(1, r.samples // 8)] for r in recordings])
+    q, v = [], []
+    for r in recordings:
+        span = min(10, r.samples - 1)
+        speed = (r.q[span:] - r.q[:-span]) / (r.time[span:] - r.time[:-span])[:, None]
+        fastest = np.abs(speed).argmax(axis=0)
+        q.append(r.q[fastest])
+        v.append(speed[fastest])
+    speed = np.concatenate([np.zeros_like(still), *v])
+    slopes = np.asarray(_slopes(loop, *jax.device_put((np.concatenate([still, *q]), speed))))
+    return _largest(slopes[: len(still)]), _largest(slopes[len(still) :])
+
+
+@compiled
+def _slopes(
+    loop: ClosedLoop, q: Float[Array, "points joints"], v: Float[Array, "points joints"]
+) -> Float[Array, "points n n"]:
+    zeros = jnp.zeros(loop.joints)
+
+    def rate(x, at, speed):
+        reference = Reference(at, speed, zeros, zeros)
+        state = unflatten(loop)(x)
+        outside = Outside(zeros, zeros, Reading(zeros, zeros))
+        now = instant(loop, jnp.zeros(()), state, reference, outside, jnp.asarray(NOBODY))
+        return ravel_pytree(now.derivative)[0]
+
+    def slope(at, speed):
+        return jax.jacfwd(rate)(ravel_pytree(rest(loop, at, speed))[0], at, speed)
+
+    return jax.vmap(slope)(q, v)
+
+
+def _largest(slopes: Float[np.ndarray, "points n n"]) -> float:
+    """Largest magnitude of an eigenvalue; zero where no slope is finite."""
+    usable = slopes[np.isfinite(slopes).all(axis=(1, 2))]
+    return float(np.abs(np.linalg.eigvals(usable)).max()) if len(usable) else 0.0

@@ -1,0 +1,89 @@
+"""Loops of the independent simulator's arms, and its recordings, for the tests of simulation."""
+
+import dataclasses
+from functools import cache
+
+import equinox as eqx
+import independent as sim
+import jax.numpy as jnp
+import numpy as np
+
+import jaxid
+from jaxid.effects import AbstractEffect, Motion, on_joint
+from jaxid.parameters import Scalar, parameter
+
+LINES = sim.MultiSine(
+    (((0.5, 2.0, 0.3), (0.2, 5.0, 1.0)), ((0.6, 3.0, 2.0), (0.2, 6.0, 0.5))), rise=1.0
+)
+MOVES = sim.Trapezoid(((0.05, 0.05, 0.2, 3.0), (0.5, -0.03, 0.25, 4.0)))
+SCARA_VALUES = {
+    "ZZ1r": 3.44,
+    "ZZ2": 0.06,
+    "MX2": 0.24,
+    "MY2": 0.01,
+    "Fv1": 0.07,
+    "Fc1": 0.23,
+    "Fv2": 0.003,
+    "Fc2": 0.05,
+}
+TWO_LINK_VALUES = {
+    "p1": 0.108,
+    "p2": 0.0443,
+    "p3": 0.0333,
+    "p4": 0.349,
+    "p5": 0.111,
+    "Fv1": 0.005,
+    "Fc1": 0.08,
+    "Fv2": 0.003,
+    "Fc2": 0.05,
+}
+TWO_LINK_GAINS = {"Kp": (60.0, 120.0), "Kv": (10.0, 15.0), "Kg": (0.15, 0.045)}
+EMPS_VALUES = {"M": 95.1, "Fv1": 203.5, "Fc1": 20.4, "offset1": -3.16, "gamma1": 1e4}
+FINE = jaxid.Stepping(substeps=8)
+# A tenth of a millimetre's worth of torque: the spline through the reference errs by 2e-6 rad
+# where the fading's third derivative jumps, 60 rad/s³ · (10 ms)³ / 24; gains are up to 22 N·m/rad.
+SPLINE = {"rtol": 0, "atol": 5e-5}
+
+
+def scara(*effects, stepping=FINE):
+    """The SCARA of the independent plant, with more effects."""
+    loop = jaxid.scara().with_values(**SCARA_VALUES).add(*effects)
+    return dataclasses.replace(loop, stepping=stepping)
+
+
+def recorded(run):
+    """A run of the independent simulator as a recording."""
+    return jaxid.Recording(run.time, run.q, run.tau, q_ref=run.q_ref)
+
+
+@cache
+def plain():
+    """The independent SCARA without any effect, 1.5 s."""
+    return sim.simulate(sim.Scara(), LINES, sim.PD(), duration=1.5)
+
+
+def simulated(loop, record=None):
+    """jaxid's run of one recording."""
+    return jaxid.simulate(loop, recorded(plain()) if record is None else record)[0]
+
+
+def independent_torque(*effects):
+    """The independent simulator's torque with effects."""
+    return sim.simulate(sim.Scara(), LINES, sim.PD(), effects, duration=1.5).tau
+
+
+def relative(ours, theirs):
+    """Difference in norm, relative, joint by joint."""
+    return np.linalg.norm(ours - theirs, axis=0) / np.linalg.norm(theirs, axis=0)
+
+
+class QuadraticDrag(AbstractEffect):
+    """Drag v|v|."""
+
+    joint: int = eqx.field(static=True)
+    drag: Scalar = parameter(0.0, symbol="drag", unit="N·m·s²/rad²", scale=0.01)
+
+    def torque(self, motion: Motion):
+        """On its joint."""
+        v = motion.v[self.joint - 1]
+        return on_joint(self.joint, self.drag * v * jnp.abs(v), motion)

@@ -1,0 +1,157 @@
+"""What a diagnosis says of a fit, and what it proposes to record next."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from stories import Bump
+
+import jaxid
+from jaxid.discovery.hypotheses import candidates, survey
+from jaxid.discovery.score import Gram, corrected, effective_tests
+from jaxid.effects import Curve, Motion, TorqueOffset
+
+
+@pytest.mark.xdist_group("offset")
+def test_predicted_error_is_the_one_that_adding_leaves(offset_story):
+    story, _ = offset_story
+    start = story.steps[0].diagnosis
+    predicted = start.predicted_error(start.ranking[0])
+    np.testing.assert_allclose(predicted, story.to_dict()["error_percent"]["after"]["fit"], 0.02)
+    assert story.table().iloc[0, 1] > 1.1 * predicted[1]
+
+
+@pytest.mark.xdist_group("bump")
+def test_own_effect_is_screened_like_the_rest(bump_story):
+    class AtHalf(Bump):
+        @classmethod
+        def screened(cls, scene):
+            return [
+                cls(joint=j, place=x, width=0.25)
+                for j in scene.joints
+                for x in np.linspace(scene.q_low[j - 1], scene.q_high[j - 1], 12)
+            ]
+
+    diagnosis = jaxid.diagnose(
+        bump_story.steps[0].fit, catalogue=(*jaxid.catalogue, AtHalf), progress=False
+    )
+    best = diagnosis.ranking[0]
+    assert (best.hypothesis.name, best.hypothesis.joint) == ("at_half", 2)
+    assert diagnosis.best.place == best.hypothesis.effect.place
+
+
+@pytest.mark.xdist_group("bump")
+def test_results_show_themselves(bump_story):
+    diagnosis = bump_story.steps[0].diagnosis
+    assert {"effect", "joint", "p_value", "amplitude"} <= set(diagnosis.table().columns)
+    assert diagnosis.where_table().iloc[0]["coordinate"] == "q2"
+    # A story keeps the signatures of its rankings alone; those of all curves are far more.
+    assert diagnosis.data.table.shape[-1] < 0.5 * len(diagnosis.gram.score)
+    with pytest.raises(jaxid.errors.FitError, match="diagnose"):
+        diagnosis.predicted_error(diagnosis.where[0])
+    for figure in (
+        diagnosis.plot(),
+        diagnosis.plot_where(),
+        diagnosis.plot_shares(joint=2),
+        bump_story.plot(),
+    ):
+        assert any(axis.title.text for axis in figure.select_xaxes())
+    assert "position of joint 2" in bump_story._repr_html_()
+
+
+def test_effective_tests_are_honest():
+    """Of tests that are one and the same there is one; of independent ones, their number."""
+    rng = np.random.default_rng(0)
+    ones = np.ones((40, 40)) + 1e-9 * np.eye(40)
+    same = Gram(ones, np.zeros(40), np.ones(40), 1.0, 1000.0)
+    apart = Gram(np.eye(40), rng.normal(size=40), np.ones(40), 1.0, 1000.0)
+    blocks = [[k] for k in range(40)]
+    # 400 draws give the mean of an exponential to 5 %; three of those.
+    assert effective_tests(same, blocks) == pytest.approx(1.0, rel=0.15)
+    assert effective_tests(apart, blocks) == pytest.approx(40.0, rel=0.15)
+    assert corrected(0.01, 10) == pytest.approx(1 - 0.99**10)
+
+
+def test_a_joint_that_is_held_still_has_shapes_to_screen():
+    time = np.arange(50) * 0.01
+    q = np.stack([np.sin(time), np.full(50, 0.3)], axis=1)
+    record = jaxid.Recording(time, q, q, q_ref=q)
+    rows, zero, v = jnp.asarray(q), jnp.asarray(0 * q), jnp.gradient(jnp.asarray(q), 0.01, axis=0)
+    state, label = jnp.zeros((50, 0)), jnp.zeros(50, int)
+    motion = jax.vmap(Motion)(jnp.asarray(time), rows, v, zero, rows, state, label)
+    motion = jax.tree.map(lambda leaf: leaf[None], motion)
+    scene = survey(jaxid.scara(), jaxid.Recordings.of(record), motion, [[1.0], [1.0]])
+    settings = [effect for effect, _ in candidates(jaxid.catalogue, scene, 1.0)]
+    assert {getattr(e, "joint", 2) for e in settings} == {1, 2}
+    for effect in settings:
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(effect)), effect
+
+
+def test_a_diagnosis_begins_where_its_fit_did():
+    """At a first velocity that a parabola through noisy samples tells badly."""
+    loop = jaxid.emps(jaxid.control.PD(Kp=[9e3], Kv=[600.0])).with_values(M=90.0, gamma1=100.0)
+    loop = dataclasses.replace(loop, freed=frozenset())
+    time = np.arange(0, 3, 0.01)
+    q_ref = 0.1 * np.sin(3 * time[:, None] + 1.0)
+    run = jaxid.simulate(loop, jaxid.Recording(time, q_ref, q_ref, q_ref=q_ref))[0]
+    noise = np.random.default_rng(0).standard_normal((2, len(time), 1))
+    q, tau = np.asarray(run.q) + 2e-4 * noise[0], np.asarray(run.tau) + 0.1 * noise[1]
+    fit = jaxid.fit(loop, jaxid.Recording(time, q, tau, q_ref=q_ref), jaxid.OEM(progress=False))
+    for judged in (fit, jaxid.compare(fit, fit.recordings)):
+        found = jaxid.diagnose(judged, catalogue=(TorqueOffset,), progress=False)
+        left = found.data.residual[0, : len(time)]
+        np.testing.assert_allclose(left, fit.residuals[0], atol=1e-3 * np.abs(left).max())
+
+
+@pytest.mark.xdist_group("offset")
+def test_unknown_catalogue_entry_is_refused(offset_story):
+    story, _ = offset_story
+    with pytest.raises(jaxid.errors.ModelError, match="cannot be screened"):
+        jaxid.diagnose(story.steps[0].fit, catalogue=("stribeck",), progress=False)
+
+
+@pytest.mark.xdist_group("offset")
+def test_effect_given_as_an_object_is_screened(offset_story):
+    story, _ = offset_story
+    diagnosis = jaxid.diagnose(
+        story.steps[0].fit, catalogue=(TorqueOffset(joint=2),), progress=False
+    )
+    assert [v.key for v in diagnosis.ranking] == [("torque_offset", 2)]
+    assert diagnosis.ranking[0].p_value < 0.01
+    assert not isinstance(diagnosis.best, Curve)
+
+
+@pytest.mark.xdist_group("offset")
+def test_next_experiment_keeps_its_limits_and_separates(offset_story):
+    story, _ = offset_story
+    diagnosis = story.steps[0].diagnosis
+    pair = [v for v in diagnosis.ranking if v.key in (("torque_offset", 2), ("spring", 2))]
+    proposed = jaxid.next_experiment(diagnosis, pair, tries=6, duration=6.0)
+    limits = jaxid.Limits.of(diagnosis.fit.recordings)
+    assert np.all(proposed.recording.q_ref >= limits.low - 1e-9)
+    assert np.all(proposed.recording.q_ref <= limits.high + 1e-9)
+    assert np.all(np.abs(proposed.recording.tau) <= 1.05 * limits.torque)
+    assert proposed.then > 0
+    torque = dataclasses.replace(diagnosis.fit.loop, controller=jaxid.control.OpenLoop())
+    driven = dataclasses.replace(diagnosis, fit=dataclasses.replace(diagnosis.fit, loop=torque))
+    with pytest.raises(jaxid.errors.FitError, match="it follows no reference"):
+        jaxid.next_experiment(driven)
+
+
+@pytest.mark.xdist_group("offset")
+def test_an_experiment_for_a_transmission_is_refused(offset_story):
+    story, _ = offset_story
+    diagnosis = story.steps[0].diagnosis
+    shaft = next(v for v in diagnosis.ranking if v.key == ("joint_elasticity", 1))
+    with pytest.raises(jaxid.errors.FitError, match="joint_elasticity on joint 1 is a simulation"):
+        jaxid.next_experiment(diagnosis, [diagnosis.ranking[0], shaft])
+
+
+def test_limits_without_a_reference_are_not_those_of_the_noise():
+    time = np.arange(0, 20, 1e-3)
+    q = np.sin(time)[:, None]
+    noise = 2e-4 * np.random.default_rng(0).standard_normal(q.shape)
+    reached = jaxid.Limits.of([jaxid.Recording(time, q + noise, q)])
+    assert 0.9 < reached.acceleration[0] < 1.5
