@@ -62,9 +62,9 @@ def linearisation(problem: Problem, whole: bool = False) -> Callable[[Any, Any],
         threads = 1
     size = problem.lower.shape[0] + 2 * problem.loop.joints * problem.free_start
     kept = whole or recordings * samples * problem.weights.shape[0] * size <= _KEPT
-    if samples > _AT_A_TIME and problem.batch.band is None:
+    if samples > _STRETCH and problem.batch.band is None:
         rows = shares_of(recordings, recordings)
-        parts = [Stretches.of(_share(problem, row), _AT_A_TIME, kept) for row in rows]
+        parts = [Stretches.of(_share(problem, row), _STRETCH, kept) for row in rows]
         return _Shared(parts, rows, threads)
     rounds = -(-recordings * samples // (threads * _AT_A_TIME))
     rows = shares_of(recordings, threads * rounds)
@@ -77,7 +77,7 @@ def linearisation(problem: Problem, whole: bool = False) -> Callable[[Any, Any],
 _WORTH_SHARING = 3000
 # Samples of one share, and intervals of a stretch of a longer recording: intermediate results of
 # more would be fresh memory each time.
-_AT_A_TIME = 40_000
+_AT_A_TIME = _STRETCH = 40_000
 # Derivatives that are kept at every point, 64 MB of them.
 _KEPT = 8_000_000
 
