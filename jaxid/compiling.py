@@ -45,10 +45,10 @@ def set_loop_threshold() -> None:
 def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """`equinox.filter_jit`, with LLVM's first level of optimisation on the CPU.
 
-    Programs then compile in two thirds of the time and run as fast. Accelerators keep their level,
-    and so does everything where the user's `XLA_FLAGS` set one. A call inside another program, or
-    under a transformation such as `jax.grad`, is compiled as what surrounds it asks for: JAX
-    refuses options there.
+    Large programs then compile in less time and run as fast (docs/process.md has numbers).
+    Accelerators keep their level, and so does everything where the user's `XLA_FLAGS` set one. A
+    call inside another program, or under a transformation such as `jax.grad`, is compiled as what
+    surrounds it asks for: JAX refuses options there.
 
     **Arguments:**
 
