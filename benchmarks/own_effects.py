@@ -17,7 +17,7 @@ import pandas as pd
 import jaxid
 from jaxid.effects import AbstractEffect
 from jaxid.errors import JaxidWarning
-from jaxid.estimate.minimise.problem import linearisation
+from jaxid.estimate.minimise import linearisation
 from jaxid.simulation.batch import prepare
 from jaxid.simulation.runs import simulate_batch
 
