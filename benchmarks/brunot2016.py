@@ -160,12 +160,8 @@ def finite_differences(m: Motion, runs: int, draws: int) -> pd.DataFrame:
 
 @eqx.filter_jit
 def _residual(problem: ls.Problem, theta: jax.Array) -> jax.Array:
-    own = problem.loop.theta.shape[0]
-    loop = problem.loop.with_theta(theta[:own])
-    raw = ls.raw_residual(loop, problem.batch, problem.weights, problem.signals)
-    blank = jnp.zeros((*raw.shape, 0))
-    plain = ls.Sensitivity(raw, raw, blank, None, jnp.zeros(len(raw), int))
-    return problem.whitened(plain, theta[own:]).residual
+    start = jnp.concatenate([problem.batch.q0, problem.batch.v0], axis=1)
+    return ls.residual_at(problem, theta, start)
 
 
 def jacobian_cost(found: dict[str, jaxid.Fit], repeats: int = 15) -> dict[str, float]:

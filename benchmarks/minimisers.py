@@ -27,7 +27,7 @@ from jaxid.estimate.minimise import (
     Stopping,
     linearisation,
     minimise,
-    raw_residual,
+    residual_at,
 )
 from jaxid.simulation.batch import prepare
 
@@ -60,11 +60,11 @@ def _count(kind: str) -> None:
 class Counted(Problem):
     """A problem that counts its evaluations as they run, not as they are traced."""
 
-    def whitened(self, plain: Sensitivity, extra: Float[Array, " _"]) -> Sensitivity:
+    def whitened(self, plain: Sensitivity, extra: Float[Array, " _"], known=None) -> Sensitivity:
         """As of any problem; simulations come without columns of derivatives."""
         kind = JACOBIAN if plain.jacobian.shape[-1] else SIMULATION
         jax.debug.callback(functools.partial(_count, kind))
-        return super().whitened(plain, extra)
+        return super().whitened(plain, extra, known)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,9 +125,8 @@ def _by_scipy(
 
 @eqx.filter_jit
 def _simulated(asked: Problem, theta: Float[Array, " parameters"]) -> Float[Array, " rows"]:
-    raw = raw_residual(asked.loop.with_theta(theta), asked.batch, asked.weights, asked.signals)
-    plain = Sensitivity(raw, raw, jnp.zeros((*raw.shape, 0)), None)
-    return asked.whitened(plain, jnp.zeros(0)).residual.ravel()
+    start = jnp.concatenate([asked.batch.q0, asked.batch.v0], axis=1)
+    return residual_at(asked, theta, start).ravel()
 
 
 def measured(job: Job) -> dict[str, Any]:

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Array, Bool, Float, Int
 
 from ..control import Reading, Reference
@@ -74,6 +73,8 @@ def _pieces(
     time: np.ndarray, values: np.ndarray, at: np.ndarray, kind: str, order: int
 ) -> np.ndarray:
     """Taylor coefficients of an interpolant at the grid points, `(points, order + 1, joints)`."""
+    import scipy
+
     beyond = np.append(time, time[-1] + 1.0)
     if kind == "cubic" and order == 3:
         spline = scipy.interpolate.CubicSpline(time, values)

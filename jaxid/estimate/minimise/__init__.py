@@ -13,6 +13,7 @@ from .minimum import minimise as minimise
 from .problem import Point as Point
 from .problem import Problem as Problem
 from .problem import point_around as point_around
+from .problem import residual_at as residual_at
 from .problem import reweighted as reweighted
 from .residual import Sensitivity as Sensitivity
 from .residual import absorb_start as absorb_start

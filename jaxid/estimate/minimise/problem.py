@@ -18,7 +18,7 @@ from ...simulation.sharing import (
 from .arrow import Arrow, Unknowns
 from .descent import Products
 from .filtering import Coefficients, known_rows
-from .residual import Sensitivity, mixed, through_filter, unfiltered
+from .residual import Sensitivity, mixed, raw_residual, through_filter, unfiltered
 
 
 class Sums(eqx.Module):
@@ -226,6 +226,21 @@ def point_around(
     batch = dataclasses.replace(problem.batch, q0=start[:, :n], v0=start[:, n:])
     found = problem.linearised(loop, batch, theta[own:])
     return problem.around(theta, start, found)
+
+
+def residual_at(
+    problem: Problem,
+    theta: Float[Array, " parameters"],
+    start: Float[Array, "recordings initials"],
+) -> Float[Array, "recordings samples outputs"]:
+    """The filtered residual alone, by a simulation without derivatives."""
+    n, own = problem.loop.joints, problem.loop.theta.shape[0]
+    loop = problem.loop.with_theta(theta[:own])
+    batch = dataclasses.replace(problem.batch, q0=start[:, :n], v0=start[:, n:])
+    raw = raw_residual(loop, batch, problem.weights, problem.signals)
+    blank = jnp.zeros((*raw.shape, 0))
+    plain = Sensitivity(raw, raw, blank, None, jnp.zeros(len(raw), int))
+    return problem.whitened(plain, theta[own:]).residual
 
 
 def reweighted(problem: Problem, point: Point, ratio: Float[Any, " outputs"]) -> Point:

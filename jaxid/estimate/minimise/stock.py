@@ -11,8 +11,7 @@ from jaxtyping import Array, Float
 from ...errors import FitError
 from ...parameters import Bounds
 from .arrow import Unknowns
-from .problem import Problem, point_around
-from .residual import Sensitivity, raw_residual
+from .problem import Problem, point_around, residual_at
 
 
 def check_solver(solver: Any, mesh: Mesh | None) -> None:
@@ -82,15 +81,7 @@ class Transformed(eqx.Module):
 
 @eqx.filter_custom_jvp
 def _residual(at: Unknowns, problem: Problem) -> Float[Array, " rows"]:
-    theta, start = at
-    n, own = problem.loop.joints, problem.loop.theta.shape[0]
-    loop = problem.loop.with_theta(theta[:own])
-    batch = eqx.tree_at(lambda b: (b.q0, b.v0), problem.batch, (start[:, :n], start[:, n:]))
-    raw = raw_residual(loop, batch, problem.weights, problem.signals)
-    blank = jnp.zeros((*raw.shape, 0))
-    return problem.whitened(
-        Sensitivity(raw, raw, blank, None, jnp.zeros(len(raw), int)), theta[own:]
-    ).residual.ravel()
+    return residual_at(problem, *at).ravel()
 
 
 @_residual.def_jvp
