@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +30,8 @@ import pandas as pd
 from scipy import integrate, optimize
 
 import jaxid
-from jaxid.estimate.minimise import linearisation, point_around
+from jaxid.estimate.minimise import linearisation, minimise, point_around
+from jaxid.simulation import runs
 from jaxid.simulation.batch import prepare
 from jaxid.simulation.integration import initial
 from jaxid.simulation.runs import each, run
@@ -331,23 +333,78 @@ def of_mujoco(recs: jaxid.Recordings) -> Peer | None:
     return Peer(name, simulate, jacobian, time.perf_counter() - started)
 
 
-def fitted(peer: Peer, recs: jaxid.Recordings) -> tuple[np.ndarray, float]:
-    """SciPy's least squares with a peer's Jacobian, from the CAD start: estimate and seconds."""
+@dataclasses.dataclass(frozen=True)
+class Ended:
+    """A whole fit: the estimate, seconds warm and cold, and what was evaluated on the way."""
+
+    theta: np.ndarray
+    warm: float
+    cold: float
+    simulations: int
+    jacobians: int
+
+
+def fitted(peer: Peer, recs: jaxid.Recordings, repeats: int) -> Ended:
+    """SciPy's least squares with a peer's Jacobian, from the CAD start."""
     measured = np.stack([d["tau"] for d in arrays(recs)])
     start = np.maximum(np.asarray(cad().theta), 1e-9)
     low = np.where([name in ("MX2", "MY2") for name in TRUTH], -np.inf, 0.0)
+
+    def solve() -> Any:
+        return optimize.least_squares(
+            lambda theta: np.nan_to_num(
+                ((np.asarray(peer.simulate(theta)) - measured) / NOISE).ravel(), nan=1e6
+            ),
+            start,
+            jac=lambda theta: (np.asarray(peer.jacobian(theta)[1]) / NOISE).reshape(-1, P),
+            x_scale="jac",
+            bounds=(low, np.inf),
+            max_nfev=60,
+        )
+
     started = time.perf_counter()
-    solved = optimize.least_squares(
-        lambda theta: np.nan_to_num(
-            ((np.asarray(peer.simulate(theta)) - measured) / NOISE).ravel(), nan=1e6
+    solved = solve()
+    first = time.perf_counter() - started
+    warm = min((once(solve) for _ in range(repeats)), default=first)
+    return Ended(solved.x, warm, peer.cold + first, int(solved.nfev), int(solved.njev or 0))
+
+
+def fitted_by_jaxid(recs: jaxid.Recordings, repeats: int) -> tuple[Ended, np.ndarray]:
+    """`jaxid.fit` with all that it does, and the deviations that it reports."""
+    loop, counts = cad(), {"simulations": 0, "jacobians": 0}
+
+    def counted(kind: str, fun: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any) -> Any:
+            counts[kind] += 1
+            return fun(*args)
+
+        return call
+
+    cold = once(lambda: jaxid.fit(loop, recs).theta)
+    warm = min(once(lambda: jaxid.fit(loop, recs).theta) for _ in range(repeats))
+    simulate = counted("simulations", runs.simulate_batch)
+    with (
+        mock.patch("jaxid.estimate.start.simulate_batch", simulate),
+        mock.patch("jaxid.estimate.converge.simulate_batch", simulate),
+        mock.patch(
+            "jaxid.estimate.minimise.minimum.linearisation",
+            lambda asked: counted("jacobians", linearisation(asked)),
         ),
-        start,
-        jac=lambda theta: (np.asarray(peer.jacobian(theta)[1]) / NOISE).reshape(-1, P),
-        x_scale="jac",
-        bounds=(low, np.inf),
-        max_nfev=60,
-    )
-    return solved.x, time.perf_counter() - started
+    ):
+        fit = jaxid.fit(loop, recs)
+    return Ended(np.asarray(fit.theta), warm, cold, **counts), np.asarray(fit.std)
+
+
+def minimised_by_jaxid(recs: jaxid.Recordings, repeats: int) -> Ended:
+    """What the peers do, no more: one minimisation from the CAD start with known weights."""
+    loop = cad()
+    batch = prepare(loop, recs)
+    asked = dataclasses.replace(problem(loop, batch), weights=jnp.full(2, 1 / NOISE))
+    start = np.concatenate([batch.q0, batch.v0], axis=1)
+    cold = once(lambda: minimise(asked, loop.theta, start).point.theta)
+    warm = min(once(lambda: minimise(asked, loop.theta, start).point.theta) for _ in range(repeats))
+    found = minimise(asked, loop.theta, start)
+    return Ended(np.asarray(found.point.theta), warm, cold, 0, found.iterations)
 
 
 def main() -> None:
@@ -406,35 +463,30 @@ def _relative(a: Any, b: np.ndarray) -> float:
 
 
 def whole_fits(seconds: float, quick: bool) -> list[dict[str, Any]]:
-    """Seconds of a fit of two recordings from the CAD start, and whether it got there."""
-    recs = recordings(2, seconds)
-    loop, rows = cad(), []
-    cold = once(lambda: jaxid.fit(loop, recs).theta)
-    fit = jaxid.fit(loop, recs)
-    warm = min(once(lambda: jaxid.fit(loop, recs).theta) for _ in range(5))
-    best = {"jaxid": (fit.theta, warm, cold)}
+    """A fit of two recordings from the CAD start: seconds, and whether it got there."""
+    recs, repeats = recordings(2, seconds), 5 if quick else 3
+    ours, deviations = fitted_by_jaxid(recs, 2 * repeats)
+    best = {"jaxid": ours, "jaxid, minimisation alone": minimised_by_jaxid(recs, 2 * repeats)}
     peers = [of_c(recs), of_casadi(recs, False), of_casadi(recs, True)]
     for peer in [p for p in peers if p is not None]:
-        theta, first = fitted(peer, recs)
-        again = min(fitted(peer, recs)[1] for _ in range(1 if quick else 3))
-        best[f"least_squares, {peer.name}"] = (theta, again, peer.cold + first)
+        best[f"least_squares, {peer.name}"] = fitted(peer, recs, repeats)
     if not quick:
-        theta, first = fitted(of_scipy(recs), recs)
-        best["least_squares, SciPy solve_ivp, differences"] = (theta, first, first)
-    for name, (theta, warm_s, cold_s) in best.items():
-        rows.append(
-            {
-                "task": "whole fit",
-                "recordings": 2,
-                "who": name,
-                "ms": 1e3 * warm_s,
-                "times_jaxid": warm_s / warm,
-                "cold_s": cold_s,
-                # In units of the deviations that the fit reports.
-                "differs": float(np.abs((theta - fit.theta) / fit.std).max()),
-            }
-        )
-    return rows
+        best["least_squares, SciPy solve_ivp, differences"] = fitted(of_scipy(recs), recs, 0)
+    return [
+        {
+            "task": "whole fit",
+            "recordings": 2,
+            "who": name,
+            "ms": 1e3 * end.warm,
+            "times_jaxid": end.warm / ours.warm,
+            "cold_s": end.cold,
+            "simulations": end.simulations,
+            "Jacobians": end.jacobians,
+            # In units of the deviations that the fit reports.
+            "differs": float(np.abs((end.theta - ours.theta) / deviations).max()),
+        }
+        for name, end in best.items()
+    ]
 
 
 def cold_starts(turns: int = 3) -> list[dict[str, Any]]:

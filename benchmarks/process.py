@@ -28,12 +28,15 @@ from ._output import options, report
 from ._problem import cad, interleaved, machine, problem, recordings, truth
 
 # What a user would set to have a process without the one, the other, or both.
-LEVEL = "--xla_backend_optimization_level=3"
+OPTIONS = (
+    "--xla_backend_optimization_level=3 --xla_cpu_use_fusion_emitters=true "
+    "--xla_cpu_parallel_codegen_split_count=32"
+)
 SETTINGS: dict[str, dict[str, str]] = {
     "as jaxid sets them": {},
     "loop threshold off": {"JAXID_SET_XLA_FLAGS": "0"},
-    "level off": {"XLA_FLAGS": LEVEL},
-    "both off": {"JAXID_SET_XLA_FLAGS": "0", "XLA_FLAGS": LEVEL},
+    "options off": {"XLA_FLAGS": OPTIONS},
+    "both off": {"JAXID_SET_XLA_FLAGS": "0", "XLA_FLAGS": OPTIONS},
 }
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
+import jax
 import jax.extend.backend
 
 # JAX has no public way to ask either. Where a later version has moved them, the flag is set as if
@@ -23,7 +24,13 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 _EXTRA = "xla_backend_extra_options"
-_LEVEL = "xla_backend_optimization_level"
+# LLVM's later passes, kernels that go through MLIR first, and modules cut into many parts cost
+# time and make no program like these faster.
+_OPTIONS: dict[str, int | bool] = {
+    "xla_backend_optimization_level": 1,
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_parallel_codegen_split_count": 1,
+}
 _THRESHOLD = f"--{_EXTRA}=xla_cpu_small_while_loop_byte_threshold=16777216"
 
 
@@ -43,12 +50,12 @@ def set_loop_threshold() -> None:
 
 
 def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """`equinox.filter_jit`, with LLVM's first level of optimisation on the CPU.
+    """`equinox.filter_jit`, with options of XLA for the CPU that make compiling quick.
 
-    Large programs then compile in less time and run as fast (docs/process.md has numbers).
-    Accelerators keep their level, and so does everything where the user's `XLA_FLAGS` set one. A
-    call inside another program, or under a transformation such as `jax.grad`, is compiled as what
-    surrounds it asks for: JAX refuses options there.
+    Programs then compile in less time and run as fast (docs/process.md has numbers). An option
+    that the user's `XLA_FLAGS` set stays theirs; accelerators get none. A call inside another
+    program, or under a transformation such as `jax.grad`, is compiled as what surrounds it asks
+    for: JAX refuses options there.
 
     **Arguments:**
 
@@ -58,20 +65,34 @@ def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result
     # Made at the first call: two dozen of them would be felt in the time of `import jaxid`.
     @functools.cache
     def jitted(outermost: bool) -> Callable[_Arguments, _Result]:
-        options: dict[str, Any] = {"compiler_options": {_LEVEL: 1}} if outermost else {}
-        return eqx.filter_jit(fun, **options)
+        options = _options() if outermost else {}
+        given: dict[str, Any] = {"compiler_options": options} if options else {}
+        return eqx.filter_jit(fun, **given)
 
     @functools.wraps(fun)
     def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        return jitted(_nothing_is_traced() and _level_is_ours())(*args, **kwargs)
+        return jitted(_nothing_is_traced())(*args, **kwargs)
 
     return call
 
 
 @functools.cache
-def _level_is_ours() -> bool:
-    """Whether all backends are CPUs and the user asked for no level; starts the backends."""
-    return set(jax.extend.backend.backends()) == {"cpu"} and not _user_sets(_LEVEL)
+def _options() -> dict[str, int | bool]:
+    """Options of this process's programs; starts the backends."""
+    if set(jax.extend.backend.backends()) != {"cpu"}:
+        return {}
+    return {name: value for name, value in _OPTIONS.items() if _is_ours(name, value)}
+
+
+def _is_ours(option: str, value: int | bool) -> bool:
+    """Whether an option is left to jaxid and known to this version of XLA."""
+    if _user_sets(option):
+        return False
+    try:
+        jax.jit(lambda: 0, compiler_options={option: value}).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 def _user_sets(flag: str) -> bool:

@@ -153,8 +153,12 @@ def options_of_programs(folder: Path, flags: str = "", **environment: str) -> di
     return {file.name.split(".")[1].removeprefix("jit_"): file.read_text() for file in files}
 
 
-def has_level(options: str) -> bool:
-    return "xla_backend_optimization_level: 1" in options
+def has_options(options: str) -> bool:
+    # What is false or zero is not printed.
+    said = {line.strip() for line in options.splitlines()}
+    emitters = "xla_cpu_use_fusion_emitters: true"
+    level, parts = "xla_backend_optimization_level: 1", "xla_cpu_parallel_codegen_split_count: 1"
+    return {level, parts} <= said and emitters not in said
 
 
 def has_threshold(options: str) -> bool:
@@ -163,9 +167,9 @@ def has_threshold(options: str) -> bool:
     return named in lines and lines[lines.index(named) + 1] == 'value: "16777216"'
 
 
-def test_level_is_that_of_jaxids_programs_alone(tmp_path):
+def test_options_are_of_jaxids_programs_alone(tmp_path):
     found = options_of_programs(tmp_path)
-    assert {name: has_level(found[name]) for name in ("ours", "theirs", "around")} == {
+    assert {name: has_options(found[name]) for name in ("ours", "theirs", "around")} == {
         "ours": True,
         "theirs": False,
         "around": False,
@@ -173,9 +177,9 @@ def test_level_is_that_of_jaxids_programs_alone(tmp_path):
     assert all(map(has_threshold, found.values()))
 
 
-def test_without_the_flag_programs_have_their_level_all_the_same(tmp_path):
+def test_without_the_flag_programs_have_their_options_all_the_same(tmp_path):
     found = options_of_programs(tmp_path, JAXID_SET_XLA_FLAGS="0")
-    assert has_level(found["ours"])
+    assert has_options(found["ours"])
     assert not any(map(has_threshold, found.values()))
 
 
@@ -185,13 +189,20 @@ def test_level_that_the_user_asks_for_holds(tmp_path):
 
 
 @pytest.mark.parametrize("backends", [{"cpu", "cuda"}, {"tpu", "cpu"}])
-def test_accelerators_keep_their_level(monkeypatch, backends):
+def test_accelerators_get_no_options(monkeypatch, backends):
     monkeypatch.delenv("XLA_FLAGS", raising=False)
-    asked = compiling._level_is_ours.__wrapped__
+    asked = compiling._options.__wrapped__
     monkeypatch.setattr(jax.extend.backend, "backends", lambda: {"cpu": None})
-    assert asked()
+    assert asked() == compiling._OPTIONS
     monkeypatch.setattr(jax.extend.backend, "backends", lambda: dict.fromkeys(backends))
-    assert not asked()
+    assert asked() == {}
+
+
+def test_options_that_this_version_of_xla_lacks_are_left_out(monkeypatch):
+    monkeypatch.setitem(compiling._OPTIONS, "xla_of_another_time", 1)
+    assert set(compiling._options.__wrapped__()) == set(compiling._OPTIONS) - {
+        "xla_of_another_time"
+    }
 
 
 def test_compiled_functions_work_inside_other_programs():
