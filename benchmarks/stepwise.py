@@ -16,10 +16,10 @@ from scipy import stats
 
 import jaxid
 from jaxid import effects as fx
+from jaxid.effects import recording_label
 from jaxid.errors import FitError
 from jaxid.estimate.regression import decimator, filtered, linear_parameters, regression
 from jaxid.parameters import list_parameters, read_values, write_values
-from jaxid.simulation.batch import recording_label
 from jaxid.simulation.dynamics import inverse
 from jaxid.simulation.runs import Simulated
 

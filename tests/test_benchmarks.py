@@ -76,6 +76,13 @@ def test_own_effects_are_timed_against_the_loop_without_them(tmp_path):
 
 
 @pytest.mark.slow
+def test_memory_is_measured_by_length(tmp_path):
+    rows = _quick("memory", tmp_path)
+    assert all(row["succeeded"] and row["peak_MiB"] > 0 for row in rows)
+    assert len(rows) > 1
+
+
+@pytest.mark.slow
 def test_settings_of_the_process_are_each_taken_away(tmp_path):
     rows = {(row["task"], row["setting"]): row for row in _quick("process", tmp_path)}
     assert {task for task, _ in rows} == {"simulation", "Jacobian", "whole fit"}

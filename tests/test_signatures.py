@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.discovery.finite import simulated
 from jaxid.discovery.hypotheses import amplitudes, survey
 from jaxid.discovery.linear import linearise
 from jaxid.discovery.signatures import signatures
 from jaxid.effects import (
     AbstractEffect,
     ActuatorLag,
+    Backlash,
     EncoderEccentricity,
     Gravity,
     JointElasticity,
@@ -26,6 +28,7 @@ from jaxid.effects import (
     Stribeck,
     TimeDelay,
     TorqueOffset,
+    TorqueSaturation,
     on_joint,
 )
 from jaxid.simulation.batch import prepare
@@ -70,6 +73,39 @@ def test_signature_is_the_derivative_of_a_simulation(record, between):
         error = np.linalg.norm(table[0, ..., column] - expected) / np.linalg.norm(expected)
         # Torque goes as a line from sample to sample, which misses most where friction is steep.
         assert error < 2e-2, (name, error)
+
+
+class Rattle(AbstractEffect):
+    """Torque that begins at a speed; nothing of it shows at nothing."""
+
+    joint: int = eqx.field(static=True)
+    size: jax.Array = jaxid.parameter(0.0, symbol="rattle", unit="N·m", linear=False)
+    finite = True
+
+    def torque(self, motion: Motion) -> jax.Array:
+        """Half of it at 1 rad/s."""
+        speed = motion.v[self.joint - 1]
+        return on_joint(self.joint, self.size * speed**3 / (1 + speed**2), motion)
+
+
+def test_finite_effects_that_share_a_program_are_as_in_simulations_of_their_own(record):
+    loop = set_substeps(jaxid.scara(), 8)
+    batch = prepare(loop, jaxid.Recordings.of(record))
+    largest = np.abs(record.tau).max(axis=0)
+    effects = [
+        JointElasticity(joint=1, compliance=2e-3, rotor=1.0),
+        JointElasticity(joint=2, compliance=1e-2, rotor=0.02),
+        Backlash(joint=2, gap=1e-3, rotor=0.02),
+        Rattle(1, 0.3),
+        TorqueSaturation(1, 0.7 * largest[0]),
+        TorqueSaturation(2, 0.8 * largest[1]),
+        JointElasticity(joint=1, compliance=4e-3, rotor=1.0),
+    ]
+    found = simulated(loop, batch, effects, row=0)
+    for effect, tau in zip(effects, found, strict=True):
+        alone = jaxid.simulate(loop.add(effect), record)[0].tau
+        # Contact is stiff: what rounding does to its first touch grows.
+        np.testing.assert_allclose(tau[0], alone, atol=1e-6 * largest.max(), err_msg=str(effect))
 
 
 class Creep(AbstractEffect):

@@ -261,6 +261,21 @@ def test_stiff_loop_says_why_an_explicit_solver_fails():
     assert not np.isfinite(run.tau).all()
 
 
+@pytest.mark.parametrize(
+    ("stepping", "status", "said"),
+    [
+        ({"control": within(1e-6)}, jaxid.Status.out_of_solver_steps, "number of solver steps"),
+        ({"substeps": 4}, jaxid.Status.diverged, "Nonfinite"),
+    ],
+    ids=["adaptive", "fixed"],
+)
+def test_fit_of_a_stiff_loop_says_why_an_explicit_solver_fails(stepping, status, said):
+    found = fitted(drag=STIFF, solver=diffrax.Tsit5(), **stepping)
+    assert not found.succeeded
+    assert found.status is status
+    assert any("diffrax" in note and said in note for note in found.notes)
+
+
 def test_stiff_loop_is_nothing_to_an_implicit_solver():
     for control in (None, within(1e-6)):
         run = simulated(loop(drag=STIFF, solver=diffrax.Kvaerno5(), control=control))

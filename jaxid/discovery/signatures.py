@@ -16,11 +16,9 @@ from ..linear_algebra import exponential
 from ..parameters import read_values, write_values
 from ..simulation.batch import Batch
 from ..simulation.dynamics import effect_loads
-from ..simulation.integration import initial
 from ..simulation.loop import ClosedLoop
-from ..simulation.runs import each, run
 from ..simulation.sharing import at_once, taken
-from ..simulation.steps import with_rolled_stages
+from .finite import simulated
 from .hypotheses import Hypothesis, amplitudes
 from .linear import Linearised, respond
 
@@ -179,23 +177,6 @@ def _grouped(effects: Sequence[AbstractEffect]) -> list[tuple[AbstractEffect, li
     ]
 
 
-@compiled
-def _finite(
-    loop: ClosedLoop, stacked: AbstractEffect, batch: Batch, row: int
-) -> Float[Array, "recordings points joints settings"]:
-    """One signal of simulations with an effect, at all its settings."""
-    loop = with_rolled_stages(loop)
-
-    def one(effect, intervals, q0, v0):
-        grown = loop.add(effect)
-        return run(grown, intervals, initial(grown, intervals, q0, v0))[1][:, row]
-
-    def setting(effect):
-        return each(lambda i, q, v: one(effect, i, q, v), batch.intervals, batch.q0, batch.v0)
-
-    return jnp.moveaxis(eqx.filter_vmap(setting, in_axes=eqx.if_array(0))(stacked), 0, -1)
-
-
 def _responses(
     loop: ClosedLoop,
     linear: Linearised,
@@ -261,20 +242,18 @@ def signatures(
         stacks = [stacked for stacked, _ in groups]
         blocks.append(_responses(loop, linear, stacks, list(made.values())))
     rest = [k for k in range(len(proposed)) if k not in made]
-    groups = _grouped([proposed[k][0] for k in rest])
     say(f"{len(rest)} signatures by simulation")
-    # Most of the first time is compiling, one program a structure.
-    runs = at_once(lambda group: np.asarray(_finite(loop, group[0], batch, row)), groups)
-    for (_, places), moved in zip(groups, runs, strict=True):
-        with np.errstate(over="ignore"):  # a loop that runs away is left out below
-            columns = (moved - np.asarray(linear.seen[:, :, row])[..., None]).astype(np.float32)
-        low, high = _amplitude_bounds(proposed[rest[places[0]]][0])
-        for column, place in zip(np.moveaxis(columns, -1, 0), places, strict=True):
-            if np.isfinite(column).all():
-                blocks.append(column[..., None])
-                effect, tests = proposed[rest[place]]
-                made[rest[place]] = Hypothesis(effect, (at,), low, high, tests)
-                at += 1
+    nominal = np.asarray(linear.seen[:, :, row])
+    for place, moved in zip(
+        rest, simulated(loop, batch, [proposed[k][0] for k in rest], row), strict=True
+    ):
+        effect, tests = proposed[place]
+        with np.errstate(over="ignore"):  # a loop that runs away is left out
+            column = (moved - nominal).astype(np.float32)
+        if np.isfinite(column).all():
+            blocks.append(column[..., None])
+            made[place] = Hypothesis(effect, (at,), *_amplitude_bounds(effect), tests)
+            at += 1
     return [made[k] for k in sorted(made)], np.concatenate(blocks, axis=-1)
 
 

@@ -1,10 +1,12 @@
 """Physical effects, one family a file, and the catalogue."""
 
+from ._base import NOBODY as NOBODY
 from ._base import AbstractEffect as AbstractEffect
 from ._base import AbstractTransmission as AbstractTransmission
 from ._base import Motion as Motion
 from ._base import check_declared as check_declared
 from ._base import on_joint as on_joint
+from ._base import recording_label as recording_label
 from ._base import smooth_sign as smooth_sign
 from ._scene import Scene as Scene
 from .curve import Curve as Curve

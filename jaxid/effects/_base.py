@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import zlib
 from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -15,6 +16,14 @@ from jaxtyping import Array, Bool, Float, Int
 from ..errors import ModelError
 from ..parameters import Scalar, list_parameters, read_values, write_values
 from ._scene import Scene
+
+# Of no recording: effects that act on some by name do not act.
+NOBODY = 0
+
+
+def recording_label(name: str) -> int:
+    """The number by which effects know a recording of that name (`Motion.label`)."""
+    return zlib.crc32(name.encode()) & 0x7FFFFFFF
 
 
 class Motion(eqx.Module):

@@ -1,6 +1,5 @@
 """Inertia that the base parameters do not hold."""
 
-import zlib
 from collections.abc import Iterable
 
 import equinox as eqx
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..parameters import Scalar, Vector, as_float64, parameter
-from ._base import AbstractEffect, Motion, on_joint
+from ._base import AbstractEffect, Motion, on_joint, recording_label
 from ._scene import Scene
 
 
@@ -72,7 +71,7 @@ class Payload(AbstractEffect):
             asked = self.mass * self._jacobian(motion.q).T @ self._lift(motion)
         if not self.recordings:
             return asked
-        labels = [zlib.crc32(name.encode()) & 0x7FFFFFFF for name in self.recordings]
+        labels = [recording_label(name) for name in self.recordings]
         carried = jnp.any(motion.label == jnp.asarray(labels))
         return jnp.where(carried, asked, 0.0)
 

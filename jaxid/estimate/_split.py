@@ -12,12 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..compiling import compiled
-from ..effects import AbstractTransmission, Motion
+from ..effects import AbstractTransmission, Motion, recording_label
 from ..errors import FitError
 from ..parameters import Bounds, list_parameters, read_values, write_values
 from ..recording import Recording, Recordings
 from ..signals.smoothing import evened
-from ..simulation.batch import recording_label
 from ..simulation.dynamics import effect_loads
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import Simulated

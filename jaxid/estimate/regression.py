@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..compiling import compiled
-from ..effects import Motion
+from ..effects import Motion, recording_label
 from ..errors import FitError
 from ..parameters import Parameter, read_values, write_values
 from ..recording import Recording
 from ..signals.smoothing import even_times, resampled, signal_cutoff, smooth_motion
-from ..simulation.batch import recording_label
 from ..simulation.dynamics import inverse
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import Simulated

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..compiling import compiled
-from ..effects import AbstractEffect, Motion
+from ..effects import NOBODY, AbstractEffect, Motion
 from ..errors import check_words
 from ..estimate.regression import linear_parameters, mismatch
 from ..parameters import Parameter, read_values, write_values
-from ..simulation.batch import NOBODY, Interval
+from ..simulation.batch import Interval
 from ..simulation.integration import initial
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import run_with_sensitivities

@@ -1,6 +1,5 @@
 """Recordings as a batch of intervals that drive a loop: made on the host, with NumPy."""
 
-import zlib
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -10,13 +9,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..control import Reading, Reference
+from ..effects import recording_label
 from ..errors import JaxidError, ModelError, RecordingError
 from ..recording import Recording, Recordings
 from ..signals.smoothing import Band
 from .loop import ClosedLoop
-
-# Of no recording: effects that act on some by name do not act.
-NOBODY = 0
 
 
 class Interval(eqx.Module):
@@ -62,11 +59,6 @@ class Batch(eqx.Module):
     def kept(self) -> Bool[Array, "recordings samples"]:
         """Which samples are there and compared."""
         return self.mask if self.band is None else self.band.keep
-
-
-def recording_label(name: str) -> int:
-    """The number by which effects know a recording of that name."""
-    return zlib.crc32(name.encode()) & 0x7FFFFFFF
 
 
 def _pieces(

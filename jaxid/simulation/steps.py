@@ -13,9 +13,10 @@ from jaxtyping import Array, Float
 
 from ..compiling import compiled
 from ..control import Reading, Reference
+from ..effects import NOBODY
 from ..errors import JaxidWarning, ModelError
 from ..recording import Recordings
-from .batch import NOBODY, check_joints
+from .batch import check_joints
 from .dynamics import Outside, instant, rest, unflatten
 from .loop import ClosedLoop
 from .stepping import RK4

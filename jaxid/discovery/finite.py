@@ -1,0 +1,145 @@
+"""What has no derivative at nothing: effects at a finite size, each in a simulation of its own."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..compiling import compiled
+from ..effects import AbstractEffect, AbstractTransmission, TorqueSaturation
+from ..parameters import KNOWN
+from ..simulation.batch import Batch
+from ..simulation.integration import initial
+from ..simulation.loop import ClosedLoop
+from ..simulation.runs import each, run
+from ..simulation.sharing import at_once, cores
+from ..simulation.steps import with_rolled_stages
+
+# Settings of one call: of more, the threads would wait for the last.
+_AT_ONCE = 16
+
+
+class OneOf(AbstractTransmission):
+    """One of several transmissions on a joint, by number; with a number below zero none.
+
+    The choice is data, so that one program serves all of them.
+    """
+
+    joint: int = eqx.field(static=True)
+    options: tuple[AbstractTransmission, ...] = eqx.field(metadata=KNOWN)
+    chosen: Int[Array, ""]
+
+    @property
+    def rotor(self) -> Float[Array, ""]:
+        """Of the chosen one."""
+        return self._of_chosen([option.rotor for option in self.options], 1.0)
+
+    def present(self) -> Bool[Array, ""]:
+        """Whether there is one, and it gives way."""
+        return self._of_chosen([option.present() for option in self.options], False)
+
+    def through(self, twist: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
+        """Torque that the chosen one passes on, N·m."""
+        return self._of_chosen([option.through(twist, rate) for option in self.options], 0.0)
+
+    def _of_chosen(self, values: Sequence[Any], otherwise: float | bool) -> Any:
+        found = jnp.asarray(otherwise)
+        for k, value in enumerate(values):
+            found = jnp.where(self.chosen == k, value, found)
+        return found
+
+
+def simulated(
+    loop: ClosedLoop, batch: Batch, effects: Sequence[AbstractEffect], row: int
+) -> list[Float[np.ndarray, "recordings points joints"]]:
+    """One signal of simulations with each effect in turn.
+
+    All transmissions and limits of all joints share a program. Finite effects of other kinds have
+    one for each structure.
+
+    **Arguments:**
+
+    - `effects`: each at a finite setting, and none on a joint whose drive and link are parted
+      already.
+    - `row`: which of `SIGNALS`.
+    """
+    shared = [k for k, e in enumerate(effects) if isinstance(e, _SHARED)]
+    groups = [(shared, _together([effects[k] for k in shared]))] if shared else []
+    for places in _alike(effects, set(shared)):
+        groups.append((places, [(effects[k],) for k in places]))
+    jobs = []
+    for places, settings in groups:
+        size = -(-len(places) // (cores() * -(-len(places) // (_AT_ONCE * cores()))))
+        for first in range(0, len(places), size):
+            # The last call repeats its last setting, for the program of the others.
+            rows = np.minimum(np.arange(first, first + size), len(places) - 1)
+            stacked = jax.tree.map(lambda *x: jnp.stack(x), *(settings[k] for k in rows))
+            jobs.append(([places[k] for k in rows], stacked))
+    runs = at_once(lambda job: np.asarray(_with_effects(loop, job[1], batch, row)), jobs)
+    found: dict[int, np.ndarray] = {}
+    for (places, _), several in zip(jobs, runs, strict=True):
+        found |= dict(zip(places, several, strict=True))
+    return [found[k] for k in range(len(effects))]
+
+
+_SHARED = (AbstractTransmission, TorqueSaturation)
+
+
+def _together(effects: Sequence[AbstractEffect]) -> list[tuple[AbstractEffect, ...]]:
+    """For each effect the same effects on all joints, of which it alone acts."""
+    kinds: dict[int, dict[Any, AbstractTransmission]] = {}
+    for e in effects:
+        if isinstance(e, AbstractTransmission):
+            kinds.setdefault(e.joint, {}).setdefault(jax.tree.structure(e), e)
+    nothing = {j: _one_of(tuple(of.values()), -1) for j, of in kinds.items()}
+    limited = sorted({e.joint for e in effects if isinstance(e, TorqueSaturation)})
+    unlimited = {j: TorqueSaturation(joint=j) for j in limited}
+    made = []
+    for e in effects:
+        parts, limits = dict(nothing), dict(unlimited)
+        if isinstance(e, TorqueSaturation):
+            limits[e.joint] = e
+        else:
+            assert isinstance(e, AbstractTransmission)
+            options = list(nothing[e.joint].options)
+            place = [jax.tree.structure(o) for o in options].index(jax.tree.structure(e))
+            options[place] = e
+            parts[e.joint] = _one_of(tuple(options), place)
+        made.append((*parts.values(), *limits.values()))
+    return made
+
+
+def _one_of(options: tuple[AbstractTransmission, ...], chosen: int) -> OneOf:
+    joint, number = options[0].joint, jnp.asarray(chosen)
+    return OneOf(joint=joint, options=options, chosen=number)  # type: ignore[reportCallIssue]
+
+
+def _alike(effects: Sequence[AbstractEffect], done: set[int]) -> list[list[int]]:
+    """Places of the effects that are left, those of one structure together."""
+    groups: dict[Any, list[int]] = {}
+    for k, effect in enumerate(effects):
+        if k not in done:
+            shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(effect))
+            groups.setdefault((jax.tree.structure(effect), shapes), []).append(k)
+    return list(groups.values())
+
+
+@compiled
+def _with_effects(
+    loop: ClosedLoop, stacked: tuple[AbstractEffect, ...], batch: Batch, row: int
+) -> Float[Array, "settings recordings points joints"]:
+    """One signal of simulations with some effects, at all their settings."""
+    loop = with_rolled_stages(loop)
+
+    def one(effects, intervals, q0, v0):
+        grown = loop.add(*effects)
+        return run(grown, intervals, initial(grown, intervals, q0, v0), rows=(row,))[1][:, 0]
+
+    def setting(effects):
+        return each(lambda i, q, v: one(effects, i, q, v), batch.intervals, batch.q0, batch.v0)
+
+    return eqx.filter_vmap(setting, in_axes=eqx.if_array(0))(stacked)
