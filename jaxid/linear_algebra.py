@@ -20,9 +20,24 @@ def solve(
 
 
 @sequential_vmap
+def _exponential(matrix: Float[Array, "size size"]) -> Float[Array, "size size"]:
+    return jax.scipy.linalg.expm(matrix)
+
+
+@jax.custom_jvp
 def exponential(matrix: Float[Array, "size size"]) -> Float[Array, "size size"]:
     """The matrix exponential, whose approximation by fractions is solved for."""
-    return jax.scipy.linalg.expm(matrix)
+    return _exponential(matrix)
+
+
+@exponential.defjvp
+def _(primals, tangents):
+    """By the exponential of a block matrix (Najfeld and Havel 1995)."""
+    (matrix,), (along,) = primals, tangents
+    n = matrix.shape[-1]
+    both = _exponential(jnp.block([[matrix, along], [jnp.zeros_like(matrix), matrix]]))
+    # The value by itself, since under `vmap` it need not have the axis that its slopes have.
+    return _exponential(matrix), both[:n, n:]
 
 
 @sequential_vmap

@@ -10,11 +10,11 @@ import pytest
 from independent import effects as fx
 
 import jaxid
-from jaxid.discovery.refits import Refits
+from jaxid.discovery.search import Asked, Search
 from jaxid.discovery.story import Step
-from jaxid.discovery.turns import Search
 from jaxid.effects import AbstractEffect, Motion, on_joint
 from jaxid.parameters import Scalar, parameter
+from jaxid.storage.campaign import Campaign
 
 
 def recordings_of(case: sim.Case) -> tuple[jaxid.Recordings, jaxid.Recordings]:
@@ -72,23 +72,32 @@ def offset_story(offset_case, tmp_path_factory):
     return story, journal
 
 
-def with_chain(search: Search, start: Step, *effects: AbstractEffect) -> list[Step]:
+def with_chain(case: sim.Case, start: Step, *effects: AbstractEffect) -> list[Step]:
     """The starting step, and one more for each effect, all in the last one's loop."""
+    plain = jaxid.OEM(start="given", progress=False)
+    method = jaxid.SeparablePEM(plain, filters=start.diagnosis.noise)
     steps = [start]
     for effect in effects:
         loop = steps[-1].fit.loop.add(effect)
-        fitted = jaxid.fit(
-            loop, search.refits.recordings, search.refits.whitened_method(start.diagnosis)
-        )
+        fitted = jaxid.fit(loop, recordings_of(case)[0], method)
         added = fitted.loop.effects[-1]
         steps.append(dataclasses.replace(start, label="+", fit=fitted, added=added))
     return steps
 
 
 def search_of(case: sim.Case) -> Search:
+    """A search that keeps nothing, before its start."""
     fit, held_out = recordings_of(case)
-    refits = Refits(recordings=fit, held_out=held_out, method=jaxid.OEM())
-    return Search(refits=refits, catalogue=jaxid.catalogue, significance=0.01)
+    asked = Asked(
+        recordings=fit,
+        held_out=held_out,
+        method=jaxid.OEM(),
+        catalogue=jaxid.catalogue,
+        significance=0.01,
+        worth=0.05,
+        most=6,
+    )
+    return Search(asked, Campaign(None, {}), silent)
 
 
 def silent(*_: object) -> None:

@@ -1,195 +1,156 @@
-"""The parts of a discovery's search: what is refitted, what is taken out, what begins afresh."""
+"""The search of a discovery: which sets it makes, which of them it keeps."""
 
 import dataclasses
-import sys
+from collections import Counter
 
 import independent as sim
 import numpy as np
 import pytest
 from independent import effects as fx
-from stories import Bump, search_of, silent, with_chain
+from stories import recordings_of, search_of, with_chain
 
 import jaxid
-from jaxid.discovery.choices import addable, doubled, rivals_of
-from jaxid.discovery.pruning import is_series, prune
-from jaxid.discovery.refits import Refits, of_one_sign, with_released
-from jaxid.discovery.story import Contender
-from jaxid.discovery.turns import Search
-from jaxid.effects import Backlash, JointElasticity, QuadraticDrag, Spring, Stribeck, TorqueOffset
+from jaxid.discovery.explore import _plain, key_of
+from jaxid.discovery.hypotheses import Hypothesis
+from jaxid.discovery.landscape import Entry, parted
+from jaxid.discovery.likelihood import price, score, weights
+from jaxid.discovery.models import Model, Visited
+from jaxid.discovery.score import Data
+from jaxid.discovery.verify import of_one_sign
+from jaxid.effects import (
+    Backlash,
+    JointElasticity,
+    QuadraticDrag,
+    Spring,
+    Stribeck,
+    TorqueOffset,
+    TorqueRipple,
+)
+
+# --- the score ------------------------------------------------------------------------------------
+
+
+def data_of(rest: np.ndarray, level: np.ndarray | None = None) -> Data:
+    none = np.zeros((*rest.shape, 0))
+    return Data(rest, none, none, np.ones(rest.shape[:2], bool), level)
+
+
+def test_score_of_white_noise_is_its_likelihood_and_the_price():
+    rest = 0.3 * np.random.default_rng(3).standard_normal((2, 500, 2))
+    found = score(data_of(rest), rest, freedom=4, size=2, offered=10)
+    assert [f.order for f in found.noise] == [0, 0]
+    spread = 1000 * np.log(np.mean(rest**2, axis=(0, 1))).sum()
+    assert found.value == pytest.approx(spread + 4 * np.log(2000) + 2 * np.log(45), rel=1e-9)
+
+
+def test_score_of_coloured_noise_pays_for_its_filter():
+    rng = np.random.default_rng(4)
+    white = rng.standard_normal((1, 4000, 1))
+    rest = np.zeros_like(white)
+    for k in range(1, 4000):
+        rest[:, k] = 0.9 * rest[:, k - 1] + white[:, k]
+    found = score(data_of(rest), rest, freedom=0, size=0, offered=10)
+    order = found.noise[0].order
+    assert order >= 1
+    assert found.noise[0].coefficients[0] == pytest.approx(-0.9, abs=0.05)
+    expected = 4000 * np.log(found.noise[0].variance) + order * np.log(4000)
+    assert found.value == pytest.approx(expected)
+
+
+def test_a_mean_is_not_taken_off():
+    """A constant that the model leaves is not noise."""
+    rest = np.random.default_rng(5).standard_normal((1, 1000, 1))
+    plain = score(data_of(rest), rest, 0, 0, 10).value
+    assert score(data_of(rest), rest + 1.0, 0, 0, 10).value > plain + 100
+
+
+def test_recordings_are_held_against_their_own_noise():
+    rng = np.random.default_rng(6)
+    rest = rng.standard_normal((2, 800, 1)) * np.array([1.0, 5.0])[:, None, None]
+    level = np.array([[1.0], [5.0]])
+    assert score(data_of(rest, level), rest, 0, 0, 10).noise[0].variance == pytest.approx(
+        1, rel=0.1
+    )
+
+
+def test_price_of_a_search():
+    assert price(0, 50) == 0
+    assert price(1, 50) == pytest.approx(2 * np.log(50))
+    assert price(2, 50) == pytest.approx(2 * np.log(50 * 49 / 2))
+
+
+def test_weights_are_odds():
+    found = weights([-7.0, -7.0 + 2 * np.log(20)])
+    assert found.sum() == pytest.approx(1)
+    assert found[0] / found[1] == pytest.approx(20)
+
+
+# --- sets of effects ------------------------------------------------------------------------------
+
+
+def test_effect_is_added_twice_at_the_most():
+    ripple = TorqueRipple(joint=1, harmonic=2.0)
+    entry = Entry(Hypothesis(ripple, (0, 1), (-np.inf,) * 2, (np.inf,) * 2), 100.0, ripple)
+    name = "torque_ripple", 1
+    assert _plain([entry], Counter({name: 1})) == [entry]
+    assert _plain([entry], Counter({name: 2})) == []
+
+
+def test_a_joint_has_one_transmission():
+    gap, shaft = Backlash(joint=1, gap=0.01), JointElasticity(joint=1, compliance=0.01)
+    assert parted([gap, TorqueOffset(joint=1), shaft])
+    assert not parted([gap, dataclasses.replace(shaft, joint=2)])
+
+
+def test_sets_are_the_same_in_any_order_and_at_any_values():
+    one, other = TorqueOffset(joint=1, level=0.1), Spring(joint=2, stiffness=3.0)
+    assert key_of([one, other]) == key_of([Spring(joint=2), TorqueOffset(joint=1)])
+    assert key_of([one]) != key_of([TorqueOffset(joint=2)])
+    assert key_of([one, one]) != key_of([one])
+
+
+def test_what_shares_the_weight_is_alike(offset_story):
+    fit = offset_story[0].fit
+    offset, spring, drag = TorqueOffset(joint=2), Spring(joint=2), QuadraticDrag(joint=1)
+    visited = Visited()
+    chosen = Model((offset,), 100.0, fit=fit)
+    for model in (
+        chosen,
+        Model((spring,), 103.0),
+        Model((drag,), 120.0),
+        Model((offset, drag), 104.0),
+        Model((), 150.0, fit=fit),
+    ):
+        visited.add(model)
+    assert visited.alike(chosen, offset, within=6.0) == (("spring", 2),)
+    shares = np.exp([0, -1.5, -10, -2, -25])
+    offset_share = (shares[0] + shares[3]) / shares.sum()
+    assert visited.probability(("torque_offset", 2)) == pytest.approx(offset_share)
+    # A prediction does not take the place of a refit.
+    visited.add(Model((TorqueOffset(joint=2),), 50.0))
+    assert visited.fitted([offset]) is chosen
 
 
 @pytest.mark.xdist_group("offset")
 def test_superfluous_effect_is_taken_out_and_a_needed_one_stays(offset_case, offset_story):
     search, start = search_of(offset_case), offset_story[0].steps[0]
+    search.visited.add(Model((), 0.0, fit=start.fit))
     offset, drag = TorqueOffset(joint=2), QuadraticDrag(joint=1)
-    left, removed = prune(search, with_chain(search, start, drag, offset), silent)
-    assert removed == (("quadratic_drag", 1),)
-    assert [s.added.effect_name() for s in left[1:]] == ["torque_offset"]
-    assert "drag" not in repr(left[-1].fit.loop)
-    left, removed = prune(search, with_chain(search, start, offset, drag), silent)
-    assert removed == (("quadratic_drag", 1),)
-    assert [s.added.effect_name() for s in left[1:]] == ["torque_offset"]
-    assert left[-1].fit.loop.effects[-1].effect_name() == "torque_offset"
+    for effects in ((drag, offset), (offset, drag)):
+        last = with_chain(offset_case, start, *effects)[-1].fit
+        at = Model(search._added(last), search._score(last, 2), fit=last)
+        left = search._without_one(at)
+        assert left is not None
+        assert left.names == (("torque_offset", 2),)
+    assert search._without_one(left) is None
 
 
 @pytest.mark.xdist_group("offset")
-def test_rival_with_less_takes_the_place_of_an_early_effect(offset_case, offset_story, monkeypatch):
-    search, start = search_of(offset_case), offset_story[0].steps[0]
-
-    def step(self, label, found, **extra):
-        return dataclasses.replace(start, label=label, fit=found, **extra)
-
-    def grown(self, last, contenders, say):
-        best = contenders[0]
-        added = best.fit.loop.effects[-1]
-        return step(self, "+", best.fit, added=added, contenders=tuple(contenders))
-
-    # Which effect goes and which comes is asked here, and a diagnosis of each takes long.
-    monkeypatch.setattr(Search, "step", step)
-    monkeypatch.setattr(Search, "grown", grown)
-    spring, drag = Spring(joint=2), QuadraticDrag(joint=1)
-    steps = with_chain(search, start, spring, drag)
-    fits = steps[1].fit, with_chain(search, start, TorqueOffset(joint=2))[1].fit
-    contenders = tuple(
-        Contender(name, 2, fitted, search.refits.criterion(fitted, start.diagnosis))
-        for name, fitted in zip(("spring", "torque_offset"), fits, strict=True)
-    )
-    steps[1] = dataclasses.replace(steps[1], contenders=contenders)
-    left, removed = prune(search, steps, silent)
-    # The drag, last and never needed, goes once the offset has come.
-    assert removed == (("quadratic_drag", 1),)
-    assert [s.added.effect_name() for s in left[1:]] == ["torque_offset"]
-    assert type(left[-1].fit.loop.effects[-1]) is TorqueOffset
-    # Not the other way round: a spring has more to adjust than an offset.
-    assert rivals_of(dataclasses.replace(left[1], contenders=contenders[::-1])) == []
-
-
-@pytest.mark.xdist_group("offset")
-def test_transmission_that_alone_does_better_begins_afresh(offset_case, offset_story, monkeypatch):
-    search, steps = search_of(offset_case), offset_story[0].steps
-    value = {"good": 5.0, "poor": 12.0}
-    found = [
-        Contender(name, 1, dataclasses.replace(steps[0].fit, notes=(word,)), 0.0)
-        for name, word in (("joint_elasticity", "poor"), ("backlash", "good"))
-    ]
-    tried = []
-
-    def refit(self, last, leading, say):
-        tried.extend(v.key for v in leading)
-        return found
-
-    def grown(self, last, contenders, say):
-        return dataclasses.replace(last, contenders=tuple(contenders))
-
-    monkeypatch.setattr(Refits, "refit", refit)
-    monkeypatch.setattr(Search, "grown", grown)
-    monkeypatch.setattr(
-        Refits, "criterion", lambda self, fit, _: value.get("".join(fit.notes[-1:]), 10.0)
-    )
-    assert search.afresh(steps, silent).contenders == (found[1],)
-    # All of them, from the starting model.
-    kinds = ("joint_elasticity", "backlash")
-    assert sorted(tried) == sorted((kind, joint) for kind in kinds for joint in (1, 2))
-    value["good"] = 11.0
-    assert search.afresh(steps, silent) is None
-
-
-def test_contact_is_released_from_several_stiffnesses():
-    loop = jaxid.scara().add(Backlash(joint=2, gap=0.01, stiffness=200.0, damping=2.0))
-    released = with_released(loop, ("kc2", "dk2"))
-    values = [dict(zip(r.names, np.asarray(r.theta), strict=True)) for r in released]
-    assert [(v["kc2"], v["dk2"]) for v in values] == [
-        (200.0, 2.0),
-        (100.0, 2.0),
-        (400.0, 2.0),
-        (200.0, 1.0),
-        (200.0, 4.0),
-    ]
-    assert with_released(loop, ()) == []
-
-
-def fits_replaced(monkeypatch, result: jaxid.Fit) -> list:
-    """Loops and methods that a discovery fits from now on, each with this result."""
-    calls = []
-
-    def fit(loop, recordings, method):
-        calls.append((loop, method))
-        return dataclasses.replace(result, loop=loop)
-
-    monkeypatch.setattr(sys.modules["jaxid.discovery.refits"], "fit", fit)
-    return calls
-
-
-@pytest.mark.xdist_group("offset")
-def test_contact_is_free_from_the_start_in_some_refits(offset_case, offset_story, monkeypatch):
-    search, start = search_of(offset_case), offset_story[0].steps[0]
-    calls = fits_replaced(monkeypatch, start.fit)
-    of = {v.key: v for v in start.diagnosis.ranking}
-    screened = of["backlash", 2].hypothesis.effect
-    loops = search.refits.starts(start, of["backlash", 2])
-    gaps = [float(loop.effects[-1].gap / screened.gap) for loop in loops]
-    assert gaps[1:] == pytest.approx([1.0, 1.0, 10.0])
-    assert ["kc2" in loop.names for loop in loops] == [False, False, True, True]
-    # Without noise filters, which knew nothing of a gap.
-    assert [type(method) for _, method in calls] == [jaxid.OEM, jaxid.OEM]
-    assert len(search.refits.starts(start, of["joint_elasticity", 2])) == 3
-    assert [f.order for f in calls[-1][1].filters] == [0, 0]
-    assert len(search.refits.starts(start, of["spring", 2])) == 1
-
-
-@pytest.mark.xdist_group("offset")
-def test_backlash_is_tried_where_an_elasticity_leads(offset_case, offset_story, monkeypatch):
-    search, start = search_of(offset_case), offset_story[0].steps[0]
-    calls = fits_replaced(monkeypatch, start.fit)
-    monkeypatch.setattr(Refits, "criterion", lambda self, fit, _: 3.0)
-    soft = JointElasticity(joint=2, compliance=0.02, rotor=0.03)
-    leading = Contender(
-        "joint_elasticity", 2, dataclasses.replace(start.fit, loop=start.fit.loop.add(soft)), 5.0
-    )
-    found = search.refits.with_siblings([leading], start, silent)
-    assert [(c.name, c.joint) for c in found] == [("backlash", 2), ("joint_elasticity", 2)]
-    loop, _ = calls[0]
-    gap = loop.effects[-1]
-    load = np.std(np.concatenate([r.tau[:, 1] for r in search.refits.recordings]))
-    assert float(gap.gap) == pytest.approx(2 * 0.02 * load)
-    assert float(gap.rotor) == 0.03
-    assert float(gap.stiffness) == pytest.approx(50.0)
-    assert "kc2" in loop.names
-    # Not of a backlash, and not of what is no transmission.
-    of = {v.key: v.hypothesis.effect for v in start.diagnosis.ranking}
-    for name in ("backlash", "spring"):
-        loop = start.fit.loop.add(of[name, 2])
-        other = Contender(name, 2, dataclasses.replace(start.fit, loop=loop), 5.0)
-        assert search.refits.with_siblings([other], start, silent) == [other]
-
-
-@pytest.mark.xdist_group("offset")
-def test_effect_is_added_twice_at_the_most(offset_story):
-    start = offset_story[0].steps[0]
-    top = next(v for v in start.diagnosis.ranking if v.possible and v.evidence > 0)
-    step = dataclasses.replace(start, added=start.diagnosis.predicted(top))
-    for often in (0, 1):
-        found = addable([start] + often * [step], lambda v: True)
-        assert top.key in [v.key for v in found]
-    assert top.key not in [v.key for v in addable([start, step, step], lambda v: True)]
-
-
-@pytest.mark.xdist_group("bump")
-def test_chain_that_a_curve_outdoes_is_a_series(bump_case, bump_story):
-    search, start = search_of(bump_case), bump_story.steps[0]
-    poor = [QuadraticDrag(joint=2), TorqueOffset(joint=2), QuadraticDrag(joint=1)]
-    assert is_series(search, with_chain(search, start, *poor), silent)
-    true = [Bump(joint=2, height=0.05, place=0.5, width=0.25), *poor[:2]]
-    assert not is_series(search, with_chain(search, start, *true), silent)
-    assert not is_series(search, with_chain(search, start, *poor[:2]), silent)
-
-
-def test_a_transmission_is_no_second_one():
-    loop = jaxid.scara().add(Backlash(joint=1, gap=0.01), TorqueOffset(joint=1))
-    shaft = JointElasticity(joint=1, compliance=0.01)
-    assert doubled(loop, 1, shaft)
-    assert not doubled(loop, 2, shaft)
-    assert not doubled(loop, 1, TorqueOffset(joint=1))
+def test_what_is_not_worth_knowing_is_not_added(offset_case, offset_story):
+    fit, held_out = recordings_of(offset_case)
+    found = jaxid.discover(jaxid.scara(), fit, held_out, worth=50.0, progress=False)
+    assert found.verdict == "adequate"
+    assert offset_story[0].verdict == "explained"
 
 
 def test_effects_share_the_sharpness_that_is_estimated_for_their_joint():
@@ -211,11 +172,7 @@ def test_a_load_that_drives_the_axis_into_its_limit_is_found():
     """
     load = fx.Payload(3.4137, 0.3, ("fit_2",))
     case = sim.make_case(1817948849, [load], noise="strong", robot="axis")
-    search = search_of(case)
-    start = search.begin(jaxid.emps(), silent)
-    verdict = next(v for v in start.diagnosis.ranking if v.key == ("payload", None))
-    assert start.diagnosis.amplitude(verdict)[0] < 0.2 * load.mass
-    (best,) = search.refits.refit(start, [verdict], silent)
-    place = best.fit.names.index("payload")
-    assert abs(best.fit.theta[place] - load.mass) < 4 * best.fit.std[place]
-    assert best.fit.loop.effects[-1].recordings == load.recordings
+    found = jaxid.discover(jaxid.emps(), *recordings_of(case), progress=False)
+    place = found.fit.names.index("payload")
+    assert abs(found.fit.theta[place] - load.mass) < 4 * found.fit.std[place]
+    assert found.loop.effects[-1].recordings == load.recordings

@@ -3,29 +3,51 @@
 import dataclasses
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import Curve, Motion, Scene
+from ..effects import Curve, Scene
+from ..errors import FitError
 from ..estimate import Fit
 from .comparison import Comparison
 from .diagnosis import Diagnosis, Verdict, share_left
 from .hypotheses import Hypothesis
+from .linear import sampled
 from .score import Data, Gram, chance, corrected, effective_tests
 from .separate import columns_of, estimate_noise, leftover
+from .system import System
 
 # Rows from which noise is told from physics as well as from all: a minute of two joints at 400 Hz.
 _ENOUGH = 50_000
 
 
-def judge(
-    fit: Fit | Comparison,
-    data: Data,
-    hypotheses: list[Hypothesis],
-    scene: Scene,
-    motion: Motion,
-    significance: float,
-) -> Diagnosis:
+class Screened(eqx.Module):
+    """The linear system of a fit, what may be missing in it, and the signatures of that."""
+
+    system: System
+    hypotheses: tuple[Hypothesis, ...]
+    data: Data
+    scene: Scene
+
+
+def judge(fit: Fit | Comparison, screened: Screened, significance: float) -> Diagnosis:
+    """Hypotheses ranked by what they explain, with the noise told apart.
+
+    **Raises:** `FitError` where what is left is too large to be held against anything.
+    """
+    try:
+        return _judged(fit, screened, significance)
+    except np.linalg.LinAlgError as error:
+        raise FitError(
+            f"what is left of these recordings by {fit.loop.name} is too large to be held against "
+            "anything: check the units of the recordings and the loop's gains"
+        ) from error
+
+
+def _judged(fit: Fit | Comparison, screened: Screened, significance: float) -> Diagnosis:
+    data, hypotheses = screened.data, list(screened.hypotheses)
+    motion = sampled(screened.system.batch, screened.system.linear.motion)
     blocks = [h.columns for h in hypotheses]
     windows = len(data.residual) != len(fit.recordings)
     apart = estimate_noise(data.middle(_ENOUGH), blocks, alike=windows)
@@ -55,7 +77,7 @@ def judge(
         noise=noise,
         data=data,
         gram=gram,
-        scene=scene,
+        scene=screened.scene,
         motion=motion,
         floor=_floor(fit, data, leftover(data, noise, columns), len(columns)),
         tests=tests,

@@ -191,9 +191,13 @@ class Gram(eqx.Module):
     @classmethod
     def of(cls, data: Data, noise: Sequence[ARFilter]) -> "Gram":
         """Whitens, projects the base out, and forms the products that tests need."""
+        return cls.of_whitened(Whitened.of(data, noise))
+
+    @classmethod
+    def of_whitened(cls, white: Whitened) -> "Gram":
+        """The products of what is whitened already."""
         import scipy
 
-        white = Whitened.of(data, noise)
         x = white.signatures
         # BLAS counts by columns: what it calls upper is our lower half.
         half = scipy.linalg.blas.ssyrk(1.0, x.T).astype(float)

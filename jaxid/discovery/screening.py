@@ -1,10 +1,8 @@
 """Every effect of the catalogue held against the residual of one fit, without a refit."""
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -13,20 +11,16 @@ from ..effects import AbstractTransmission
 from ..effects import catalogue as known
 from ..errors import FitError
 from ..estimate import Fit
-from ..estimate.converge import from_best_starts
-from ..estimate.oem import oem_of
-from ..estimate.pieces import compared_signals, estimated_starts, pieces_of
 from ..recording import Recordings
-from ..simulation.batch import Batch, prepare
 from ..simulation.loop import ClosedLoop
-from ..simulation.steps import with_substeps
 from .comparison import Comparison
 from .diagnosis import Diagnosis
 from .hypotheses import Hypothesis, candidates, curves, survey
-from .linear import Linearised, at_samples, base_columns, linearise, sampled
-from .ranking import judge
+from .linear import at_samples
+from .ranking import Screened, judge
 from .score import Data
 from .signatures import signatures
+from .system import System
 
 
 def diagnose(
@@ -58,40 +52,37 @@ def diagnose(
             "with it, and there is nothing to diagnose"
         )
     with working(f"diagnosis of {fit.loop.name}", progress) as say:
-        loop = with_substeps(fit.loop, fit.recordings)
-        output, batch, free = _as_fitted(fit, loop)
-        say("linearising along the recordings")
-        linear = linearise(loop, batch, output)
-        residual, base = _residual_and_base(batch, linear, loop, output, free)
-        if not np.isfinite(residual).all() or not np.isfinite(base).all():
-            raise FitError(
-                f"{loop.name} cannot be simulated at its fitted values, so nothing can be held "
-                "against its residual: fit it by OEM first"
-            )
-        tones, trials = _tones(residual, np.asarray(batch.kept), fit.recordings)
-        scene = survey(loop, fit.recordings, linear.motion, tones)
-        proposed = candidates(catalogue, scene, trials)
-        parted = {e.joint for e in loop.effects if isinstance(e, AbstractTransmission)}
-        proposed = [
-            (effect, tests)
-            for effect, tests in proposed
-            if not (isinstance(effect, AbstractTransmission) and effect.joint in parted)
-        ]
-        proposed += [(curve, 1.0) for curve in curves(scene, linear.motion)]
-        row = {"tau": 0, "q": 1}[output]
-        hypotheses, table = signatures(loop, batch, linear, proposed, row, say)
-        _check_finite(loop, hypotheses, table)
-        table = at_samples(batch, table)
-        data = Data(residual=residual, base=base, table=table, mask=np.asarray(batch.kept))
-        say(f"scoring {len(hypotheses)} hypotheses")
-        try:
-            motion = sampled(batch, linear.motion)
-            return judge(fit, data, hypotheses, scene, motion, significance)
-        except np.linalg.LinAlgError as error:
-            raise FitError(
-                f"what is left of these recordings by {loop.name} is too large to be held against "
-                "anything: check the units of the recordings and the loop's gains"
-            ) from error
+        return judge(fit, screen(fit, catalogue, say), significance)
+
+
+def screen(fit: Fit | Comparison, catalogue: Sequence[Any], say: Callable[[str], None]) -> Screened:
+    """The linear system of a fit, and the signatures of all that may be missing.
+
+    **Arguments:** as for `diagnose`.
+    """
+    say("linearising along the recordings")
+    system = System.of(fit)
+    loop, linear = system.loop, system.linear
+    tones, trials = _tones(system.residual, system.mask, fit.recordings)
+    scene = survey(loop, fit.recordings, linear.motion, tones)
+    proposed = candidates(catalogue, scene, trials)
+    parted = {e.joint for e in loop.effects if isinstance(e, AbstractTransmission)}
+    proposed = [
+        (effect, tests)
+        for effect, tests in proposed
+        if not (isinstance(effect, AbstractTransmission) and effect.joint in parted)
+    ]
+    proposed += [(curve, 1.0) for curve in curves(scene, linear.motion)]
+    hypotheses, table = signatures(loop, system.batch, linear, proposed, system.row, say)
+    _check_finite(loop, hypotheses, table)
+    data = Data(
+        residual=system.residual,
+        base=system.base,
+        table=at_samples(system.batch, table),
+        mask=system.mask,
+    )
+    say(f"scoring {len(hypotheses)} hypotheses")
+    return Screened(system, tuple(hypotheses), data, scene)
 
 
 def _check_finite(
@@ -113,41 +104,6 @@ def _check_finite(
             f"the signature of {first.name} on joint {first.joint or 'all'} is not finite along "
             "these recordings: mend its torque, or leave it out of the catalogue"
         )
-
-
-def _as_fitted(fit: Fit | Comparison, loop: ClosedLoop) -> tuple[str, Batch, np.ndarray]:
-    """Which output is compared, the batch, and which initial states are free, as in the fit."""
-    method = oem_of(fit)
-    pieces = pieces_of(fit.recordings, method.window)
-    batch = prepare(loop, pieces)
-    free = estimated_starts(method, pieces, batch)
-    if free.any():
-        start, n = getattr(getattr(fit, "optimum", None), "start", None), loop.joints
-        if start is not None and len(start) == len(pieces):
-            batch = dataclasses.replace(batch, q0=start[:, :n], v0=start[:, n:])
-        else:
-            batch = from_best_starts(method, loop, pieces, batch)
-    return compared_signals(method, loop)[0], batch, free
-
-
-def _residual_and_base(
-    batch: Batch, linear: Linearised, loop: ClosedLoop, output: str, free: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    seen = sampled(batch, np.asarray(linear.seen[:, :, {"tau": 0, "q": 1}[output]]))
-    residual = (np.asarray(getattr(batch, output)) - seen) * np.asarray(batch.mask)[..., None]
-    if batch.band is not None:
-        residual = np.asarray(batch.band(jnp.asarray(residual)))
-    p = loop.theta.shape[0]
-    base = at_samples(batch, np.asarray(base_columns(linear, p, bool(free.any()))))
-    if not free.any():
-        return residual, base
-    shared, own = base[..., :p], base[..., p:]
-    blocks = [shared]
-    for k in np.flatnonzero(free):
-        alone = np.zeros_like(own)
-        alone[k] = own[k]
-        blocks.append(alone)
-    return residual, np.concatenate(blocks, axis=-1)
 
 
 def _tones(

@@ -1,25 +1,44 @@
-"""The loop of diagnose, add, refit, until nothing significant is left."""
+"""The search for what a model lacks: predict in the linear system, verify by full fits."""
 
 import dataclasses
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import numpy as np
+
 from ..control import OpenLoop
 from ..display.progress import working
+from ..effects import AbstractEffect
 from ..effects import catalogue as known
 from ..errors import FitError
-from ..estimate import OEM, Status
+from ..estimate import OEM, Fit, Status
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
-from .choices import addable
-from .pruning import is_series, prune
-from .refits import Refits
-from .story import Discovery, Outcome, Step, step_name
-from .turns import Search
+from .comparison import compare
+from .diagnosis import Diagnosis
+from .explore import DECISIVE, Candidate, explore
+from .hypotheses import effect_on
+from .landscape import Landscape, form
+from .likelihood import score_of
+from .models import Model, Named, Visited, named
+from .ranking import Screened, judge
+from .screening import screen
+from .story import Contender, Discovery, Outcome, Step
+from .verify import Refits, is_there, quiet
+
+# Sets that are refitted in one round, and the share of what the best gains by which predictions
+# are off.
+_VERIFIED, _INEXACT = 3, 0.08
+# Effects that a fitted model is short of at most: sets of two are predicted to a few per cent of
+# what they explain, larger ones are looked for from the next fit.
+_AHEAD = 2
+# Difference of scores up to which a rival has a weight worth naming: odds of 20 to 1.
+LIKELY = 6.0
 
 
 def discover(
@@ -30,23 +49,26 @@ def discover(
     catalogue: Sequence[Any] = known,
     method: OEM | None = None,
     significance: float = 0.01,
+    worth: float = 0.05,
     most: int = 6,
     resume: str | Path | None = None,
     progress: bool = True,
 ) -> Discovery:
-    """Finds what the model lacks: diagnose, add, refit, until nothing significant is left.
+    """Finds what the model lacks: the set of effects of the best score.
 
-    Then each added effect is tried without.
+    Sets are predicted in the linear system along the fitted runs; the best few are fitted in full;
+    and the system is linearised again at the winner, until nothing predicted is better.
 
     **Arguments:**
 
     - `loop`: the starting model.
-    - `recordings`: to fit. `validate`: held out, to judge by.
+    - `recordings`: to fit. `validate`: held out; they enter no score.
     - `catalogue`: as for `diagnose`.
     - `method`: of the fits.
-    - `significance`: corrected p-value below which something counts as missing.
+    - `significance`: corrected p-value below which a diagnosis says that something is missing.
+    - `worth`: what is worth knowing: an effect must change some joint's torque by this share, %.
     - `most`: how many effects to add at the most.
-    - `resume`: a folder in which every step is saved as it ends, and from which the same call
+    - `resume`: a folder in which every fit is saved as it ends, and from which the same call
       goes on; it is made where it is not there.
 
     **Raises:** `FitError`, `ModelError`, `RecordingError` where model and recordings do not fit;
@@ -63,59 +85,299 @@ def discover(
     recordings = Recordings.of(recordings)
     held_out = None if validate is None else Recordings.of(validate)
     Recordings.of([*recordings, *(held_out or ())]).common_period()
-    search = Search(
-        refits=Refits(recordings=recordings, held_out=held_out, method=method or OEM()),
-        catalogue=tuple(catalogue),
-        significance=significance,
+    asked = Asked(
+        recordings, held_out, method or OEM(), tuple(catalogue), significance, worth, most
     )
-    plan = {"loop": loop, "search": search.plan(), "most": most}
     with (
         working(f"discovery on {loop.name}", progress) as say,
-        Campaign(resume, plan, classes_of(loop) | _classes_in(search.catalogue)) as campaign,
+        Campaign(
+            resume, {"loop": loop, "search": asked.plan()}, classes_of(loop) | asked.classes()
+        ) as campaign,
     ):
+        search = Search(asked, campaign, say)
+        verdict, unfinished = search.run(loop)
+        return search.story(verdict, unfinished, started)
 
-        def follow(steps: list[Step], name: str) -> tuple[Outcome, list[Step]]:
-            verdict: Outcome | None = None
-            while verdict is None:
-                verdict, more = campaign.piece(
-                    f"{name} {len(steps)}", lambda: search.turn(steps, most, say)
-                )
-                steps.extend(more)
-            return verdict, steps
 
-        start = campaign.piece("start", lambda: search.begin(loop, say))
+class Asked(eqx.Module):
+    """What a discovery was asked."""
+
+    recordings: Recordings
+    held_out: Recordings | None
+    method: OEM
+    catalogue: tuple[Any, ...]
+    significance: float
+    worth: float
+    most: int
+
+    def plan(self) -> dict[str, Any]:
+        """What the fits follow from, beside the starting model."""
+        return {
+            "recordings": self.recordings,
+            "validate": self.held_out,
+            "catalogue": [_entry(entry) for entry in self.catalogue],
+            "method": quiet(self.method),
+            "significance": self.significance,
+            "worth": self.worth,
+            "most": self.most,
+        }
+
+    def classes(self) -> set[type]:
+        """The classes of effects that the catalogue names; what its functions make is not known."""
+        given = {entry for entry in self.catalogue if isinstance(entry, type)}
+        return given.union(*(classes_of(entry) for entry in self.catalogue))
+
+
+class Search:
+    """A search under way: which models were looked at, and which is the best."""
+
+    def __init__(self, asked: Asked, campaign: Campaign, say: Callable[[str], None]) -> None:
+        self.asked, self.campaign, self.say = asked, campaign, say
+        self.refits = Refits(asked.recordings, asked.method)
+        self.visited = Visited()
+        self.level: np.ndarray | None = None
+        self.forms = 0
+        self.removed: tuple[Named, ...] = ()
+        self.seen: dict[tuple, tuple[Screened, Diagnosis]] = {}
+
+    def run(self, loop: ClosedLoop) -> tuple[Outcome, bool]:
+        """Rounds of predicting and verifying, until nothing is better; the verdict follows."""
+        at = self._start(loop)
+        while True:
+            candidates, nothing = self._predicted(at)
+            better = self._verified(at, candidates, nothing)
+            if better is None and (better := self._without_one(at)) is not None:
+                gone = [n for n in at.names if n not in better.names]
+                self.removed = (*self.removed, *gone)
+            if better is None:
+                break
+            at = better
+        self.at = at
+        return self._verdict(candidates, nothing)
+
+    def _start(self, loop: ClosedLoop) -> Model:
+        """The starting model, fitted with the noise known."""
+        self.say("fit of the starting model")
+        first = self.campaign.piece("start", lambda: self.refits.first(loop))
         # A recording along which the first fit runs away is left out of all that follows.
-        refits = dataclasses.replace(search.refits, recordings=start.fit.recordings)
-        search = dataclasses.replace(search, refits=refits)
-        verdict, steps = follow([start], "turn")
-        if verdict == "outside_catalogue" and len(steps) > 1:
-            parted = campaign.piece("afresh", lambda: search.afresh(steps, say))
-            if parted is not None:
-                verdict, steps = follow([steps[0], parted], "afresh")
-        unfinished = len(steps) > most and bool(addable(steps, search.matters(steps)))
-        steps, removed = prune(search, steps, say)
+        self.refits = dataclasses.replace(self.refits, recordings=first.recordings)
+        _, diagnosis = self._screened(first)
+        # Where noise is strongly coloured, plain output error leaves the parameters far off. A
+        # filter fitted to the residual itself would take what is missing for noise.
+        again = self.campaign.piece(
+            "start, filtered", lambda: self.refits.filtered(first.loop, diagnosis.noise)
+        )
+        again = dataclasses.replace(again, notes=(*first.notes, *again.notes))
+        fit = again if again.succeeded else first
+        _, diagnosis = self._screened(fit, ())
+        self.level = diagnosis.data.level
+        model = Model((), self._score(fit, 0), fit=fit)
+        self.visited.add(model)
+        return model
+
+    def _screened(self, fit: Fit, effects: Sequence[AbstractEffect] | None = None):
+        """The linear system at a fit with its signatures, and the diagnosis."""
+        screened = screen(fit, self.asked.catalogue, self.say)
+        found = screened, judge(fit, screened, self.asked.significance)
+        if effects is not None:
+            self.seen[Model(tuple(effects), 0.0).key] = found
+        return found
+
+    def _predicted(self, at: Model) -> tuple[list[Candidate], float]:
+        """Sets beside a fitted model, best first, and the score of adding nothing."""
+        assert at.fit is not None
+        found = self.seen.get(at.key) or self._screened(at.fit, at.effects)
+        screened, diagnosis = found
+        data = dataclasses.replace(screened.data, level=diagnosis.data.level)
+        landscape = Landscape.of(screened.system, data, screened.hypotheses, diagnosis.noise)
+        self.forms = max(self.forms, landscape.forms)
+        left = min(self.asked.most - len(at.effects), _AHEAD)
+        candidates = explore(landscape, left, self.say, at.effects)
+        plain = next(c for c in candidates if not c.effects and c.curve is None)
+        return [c for c in candidates if c is plain or self._matters(at, c, plain)], plain.score
+
+    def _verified(self, at: Model, candidates: Sequence[Candidate], nothing: float) -> Model | None:
+        """The best refit of the sets that promise most; None where none is better."""
+        plain = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
+        tried: list[Candidate] = []
+        if plain:
+            reach = max(DECISIVE, _INEXACT * (nothing - plain[0].score))
+            tried = [c for c in plain if c.score < plain[0].score + reach][:_VERIFIED]
+        # Effects that come close to what one curve says better are no explanation.
+        alone = [c.score for c in candidates if c.curve is not None and not c.effects]
+        gain = nothing - min(alone, default=np.inf)
+        limit = at.score - max(gain - max(DECISIVE, _INEXACT * gain), 0.0)
+        found = [(m, c) for c in tried if (m := self._fitted(at, c, nothing - c.score)) is not None]
+        better = [pair for pair in found if pair[0].score < limit]
+        best = min(better, key=lambda pair: pair[0].score, default=None)
+        anchor = at.score - nothing if best is None else best[0].score - best[1].score
+        self.visited.add_predicted(candidates, at, anchor)
+        return None if best is None else best[0]
+
+    def _fitted(self, at: Model, asked: Candidate, promised: float) -> Model | None:
+        """A set beside a fitted model, fitted in full; None where it does not show."""
+        assert at.fit is not None
+        before: Fit = at.fit
+        together = (*at.effects, *asked.effects)
+        had = self.visited.fitted(together)
+        if had is not None:
+            return had
+        self.say(f"fit with {_listed(asked.effects)}")
+        fit = self.campaign.piece(
+            f"with {_listed(together)}",
+            lambda: self.refits.with_effects(before, asked.effects, asked.noise, promised),
+        )
+        if not fit.status.simulated or not is_there(fit, before):
+            return None
+        model = Model(self._added(fit), self._score(fit, len(together)), fit=fit)
+        self.visited.add(model)
+        return model
+
+    def _without_one(self, at: Model) -> Model | None:
+        """The model without one of its effects, where that is better."""
+        if len(at.effects) < 2:
+            return None
+        found = []
+        for gone in at.effects:
+            less = tuple(e for e in at.effects if e is not gone)
+            had = self.visited.fitted(less)
+            found.append(had or self._refitted(at, less))
+        best = min(found, key=lambda m: m.score)
+        return best if best.score < at.score else None
+
+    def _refitted(self, at: Model, effects: Sequence[AbstractEffect]) -> Model:
+        """A part of a fitted model's effects, fitted from where they are."""
+        assert at.fit is not None
+        loop, noise = at.fit.loop, self._noise(at.fit)
+        kept = [e for e in loop.effects if not any(e is x for x in at.effects)]
+        self.say(f"fit with {_listed(effects)} alone")
+        fit = self.campaign.piece(
+            f"with {_listed(effects)}",
+            lambda: self.refits.filtered(loop.with_effects((*kept, *effects)), noise),
+        )
+        model = Model(self._added(fit), self._score(fit, len(effects)), fit=fit)
+        self.visited.add(model)
+        return model
+
+    def _added(self, fit: Fit) -> tuple[AbstractEffect, ...]:
+        """The effects that a fit has over the starting model; they stand last."""
+        start = self.visited.fitted(())
+        assert start is not None
+        assert start.fit is not None
+        return fit.loop.effects[len(start.fit.loop.effects) :]
+
+    def _score(self, fit: Fit, size: int) -> float:
+        return score_of(fit, self._level_of(fit), size, self.forms or _forms(self.seen)).value
+
+    def _level_of(self, fit: Fit) -> np.ndarray | None:
+        return None if self.level is None or len(self.level) != len(fit.residuals) else self.level
+
+    def _noise(self, fit: Fit):
+        return score_of(fit, self._level_of(fit)).noise
+
+    def _matters(self, at: Model, c: Candidate, plain: Candidate) -> bool:
+        """Whether a set changes what is left of some joint's torque by what is worth knowing."""
+        assert at.fit is not None
+        if at.fit.error_percent.to_numpy().max() < 1e-3:
+            # Recordings without noise: what is left is the integration's.
+            return False
+        size = np.mean([np.linalg.norm(r.tau, axis=0) for r in at.fit.recordings], axis=0)
+        changed = np.linalg.norm((c.rest - plain.rest).reshape(-1, c.rest.shape[-1]), axis=0)
+        many = np.sqrt(len(at.fit.recordings))
+        return bool(np.any(changed / many > self.asked.worth / 100 * size))
+
+    def _verdict(self, candidates: Sequence[Candidate], nothing: float) -> tuple[Outcome, bool]:
+        unfinished = len(self.at.effects) >= self.asked.most and self.asked.most > 0
+        curved = [c for c in candidates if c.curve is not None and c.score < nothing]
+        best = self.visited.ranked()[0]
+        if best.curve is not None and best.score < self.at.score - DECISIVE:
+            # Effects in a row came close to something that one curve says with less.
+            less = self.visited.fitted(best.effects)
+            if less is not None and set(less.key) < set(self.at.key):
+                self.at = less
+            return "outside_catalogue", False
+        if curved and curved[0].score == min(c.score for c in candidates):
+            return "outside_catalogue", False
+        left = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
+        return ("explained" if self.at.effects else "adequate"), unfinished and bool(left)
+
+    # --- the story --------------------------------------------------------------------------------
+
+    def story(self, verdict: Outcome, unfinished: bool, started: float) -> Discovery:
+        """What was found, step by step."""
+        steps = self._steps()
+        last = steps[-1].fit
+        explained = verdict == "outside_catalogue" and last.error_percent.min(axis=None) < 99
+        if last.status is Status.misfit and not explained:
+            raise FitError(
+                f"neither {last.loop.name} nor the catalogue explains anything of these "
+                f"recordings: {last.notes[-1]}"
+            )
         notes = _notes(steps)
         if unfinished:
-            notes = (f"stopped after {most} effects, as told: raise most to go on", *notes)
-        if is_series(search, steps, say):
-            note, steps, removed = _series_note(steps), steps[:1], ()
-            verdict, notes, unfinished = "outside_catalogue", (*_notes(steps), note), False
-    # What is outside may well leave more of one joint's signal than there was, but not of all.
-    explained = verdict == "outside_catalogue" and steps[-1].fit.error_percent.min(axis=None) < 99
-    if steps[-1].fit.status is Status.misfit and not explained:
-        raise FitError(
-            f"neither {loop.name} nor the catalogue explains anything of these recordings: "
-            f"{steps[-1].fit.notes[-1]}"
+            notes = (f"stopped after {self.asked.most} effects, as told: raise most", *notes)
+        return Discovery(
+            verdict=verdict,
+            steps=tuple(steps),
+            removed=self.removed,
+            notes=notes,
+            seconds=time.perf_counter() - started,
+            unfinished=unfinished,
         )
-    seconds = time.perf_counter() - started
-    return Discovery(
-        verdict=verdict,
-        steps=tuple(steps),
-        removed=removed,
-        notes=notes,
-        seconds=seconds,
-        unfinished=unfinished,
-    )
+
+    def _steps(self) -> list[Step]:
+        """The starting model, and one more effect in each step."""
+        start = self.visited.fitted(())
+        assert start is not None
+        models = [start]
+        for k in range(1, len(self.at.effects)):
+            less = self.at.effects[:k]
+            models.append(self.visited.fitted(less) or self._refitted(self.at, less))
+        if self.at.effects:
+            models.append(self.at)
+        steps = []
+        for k, model in enumerate(models):
+            assert model.fit is not None
+            _, diagnosis = self.seen.get(model.key) or self._screened(model.fit, model.effects)
+            held_out = self.asked.held_out
+            held = None if held_out is None else compare(model.fit, held_out)
+            step = Step(label="start", fit=model.fit, held_out=held, diagnosis=diagnosis.light())
+            if k:
+                added = model.effects[-1]
+                step = dataclasses.replace(
+                    step,
+                    label=f"+ {effect_on(*named(added))}",
+                    added=added,
+                    alike=self.visited.alike(model, added, LIKELY),
+                    contenders=self._contenders(models[k - 1], model),
+                )
+            steps.append(step)
+        return steps
+
+    def _contenders(self, before: Model, chosen: Model) -> tuple[Contender, ...]:
+        """The refits of the same size that have all but one effect in common, the chosen first."""
+        had = {named(e) for e in before.effects}
+        found = [
+            (named(e), m)
+            for m in self.visited.ranked(lambda m: m.fit is not None)
+            if len(m.effects) == len(chosen.effects)
+            for e in m.effects[-1:]
+            if {named(x) for x in m.effects[:-1]} == had
+        ]
+        return tuple(
+            Contender(name=name, joint=joint, fit=m.fit, criterion=m.score)
+            for (name, joint), m in found
+            if m.fit is not None
+        )
+
+
+def _forms(seen: dict[tuple, tuple[Screened, Diagnosis]]) -> int:
+    """How many effects there are to choose from, by what was screened last."""
+    return max((len({form(h.effect) for h in s.hypotheses}) for s, _ in seen.values()), default=1)
+
+
+def _listed(effects: Sequence[AbstractEffect]) -> str:
+    return " and ".join(effect_on(*named(e)) for e in effects)
 
 
 def _notes(steps: Sequence[Step]) -> tuple[str, ...]:
@@ -125,13 +387,7 @@ def _notes(steps: Sequence[Step]) -> tuple[str, ...]:
     return (f"the fit of {', '.join(bad)} did not converge: read its values with care",)
 
 
-def _series_note(steps: Sequence[Step]) -> str:
-    """What is said of effects that together did less than one curve."""
-    names = ", ".join(step_name(s) for s in steps if s.added is not None)
-    return f"{names} together come close, but one curve does better with less: they were taken out"
-
-
-def _classes_in(catalogue: Sequence[Any]) -> set[type]:
-    """The classes of effects that a catalogue names; what its functions make is not known yet."""
-    given = {entry for entry in catalogue if isinstance(entry, type)}
-    return given.union(*(classes_of(entry) for entry in catalogue))
+def _entry(entry: Any) -> Any:
+    """An entry of a catalogue as a plan names it: classes and functions by their names."""
+    name = getattr(entry, "__qualname__", None)
+    return entry if name is None else f"{entry.__module__}.{name}"

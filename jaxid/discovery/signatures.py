@@ -13,10 +13,11 @@ from jaxtyping import Array, Float
 from ..compiling import compiled
 from ..effects import AbstractEffect, Motion
 from ..linear_algebra import exponential
-from ..parameters import read_values, write_values
+from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..simulation.batch import Batch
 from ..simulation.dynamics import effect_loads
 from ..simulation.loop import ClosedLoop
+from ..simulation.runs import each
 from ..simulation.sharing import at_once, taken
 from .finite import simulated
 from .hypotheses import Hypothesis, amplitudes
@@ -84,10 +85,23 @@ AllForces = tuple[
 def _forces(effect: AbstractEffect, motion: Motion, left: Float[Array, "points joints"]) -> Forces:
     """What the effect adds to joint torque, position read and velocity read, by amplitude."""
     linear = amplitudes(effect)
+    along = _force_by(effect, linear, motion, left)
+    if linear:
+        return jax.jacfwd(along)(read_values(effect, linear))
+    return jax.tree.map(lambda x: x[..., None], along(jnp.zeros(0)))
 
-    def along(values: Float[Array, " columns"]):
-        here = write_values(effect, linear, values) if linear else effect
-        # Here, since an amplitude may stand in the rate of a state.
+
+def _force_by(
+    effect: AbstractEffect,
+    parameters: tuple[Parameter, ...],
+    motion: Motion,
+    left: Float[Array, "points joints"],
+) -> Callable[[Float[Array, " values"]], Any]:
+    """The same as a function of some of the effect's parameters."""
+
+    def along(values: Float[Array, " values"]):
+        here = write_values(effect, parameters, values) if parameters else effect
+        # Here, since a parameter may stand in the rate of a state.
         states = _settled_states(here, motion)
 
         def one(at: Motion, state, rest):
@@ -98,13 +112,27 @@ def _forces(effect: AbstractEffect, motion: Motion, left: Float[Array, "points j
 
         return jax.vmap(one)(motion, states, left)
 
-    if linear:
-        return jax.jacfwd(along)(read_values(effect, linear))
-    return jax.tree.map(lambda x: x[..., None], along(jnp.zeros(0)))
+    return along
 
 
 @compiled
-def _left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings points joints"]:
+def force_and_slopes(
+    effect: AbstractEffect, motion: Motion, left: Float[Array, "recordings points joints"]
+) -> Forces:
+    """The effect's force on each run as it is, and by each of its free parameters, in columns."""
+    free = tuple(p for p in list_parameters(effect) if p.declaration.free)
+    values = read_values(effect, free)
+
+    def of_run(run: Motion, left) -> Forces:
+        along = _force_by(effect, free, run, left)
+        both = along(values), jax.jacfwd(along)(values)
+        return jax.tree.map(lambda x, d: jnp.concatenate([x[..., None], d], -1), *both)
+
+    return each(of_run, motion, left)
+
+
+@compiled
+def left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings points joints"]:
     """Torque that the loop's own effects on the drives leave for the links along the runs."""
 
     def remaining(at: Motion, states: tuple[Float[Array, " _"], ...]):
@@ -189,7 +217,7 @@ def _responses(
     """
     reading = _columns(hypotheses, _misreads)
     behind = _columns(hypotheses, lambda e: e.on_link) if "pull" in linear.places else []
-    left = _left_for_links(loop, linear.motion)
+    left = left_for_links(loop, linear.motion)
 
     def along(k: int) -> Float[np.ndarray, "points outputs columns"]:
         alone, remaining = taken((linear, left), np.array([k]))

@@ -29,7 +29,7 @@ Outcome = Literal["adequate", "explained", "outside_catalogue"]
 
 
 class Contender(eqx.Module):
-    """One effect, added and refitted, with how well it does."""
+    """One effect, added and fitted in full; `criterion` is the model's score, less is better."""
 
     name: str
     joint: int | None

@@ -119,11 +119,12 @@ def _rivals(step: Step) -> list[Content]:
             for c in step.contenders
         ]
         said = (
-            "The leading entries were added and refitted in full. The criterion is the whitened "
-            "squared error on fitted and held-out recordings plus BIC's price; less is better, "
-            "and a difference of ten is decisive."
+            "The sets of effects that promised most were fitted in full. The score is -2 log of "
+            "the likelihood of the fitted recordings, plus the price of what was estimated and of "
+            "the search; less is better, and a difference of ten is decisive. Held-out recordings "
+            "do not enter it."
         )
-        columns = ["effect", "joint", "form", "criterion", "behind the best", "fitted error, %"]
+        columns = ["effect", "joint", "form", "score", "behind the best", "fitted error, %"]
         pieces += [tag("p", said), table(columns, rows, "refitted contenders")]
     if step.alike:
         others = ", ".join(n + ("" if j is None else f" on joint {j}") for n, j in step.alike)

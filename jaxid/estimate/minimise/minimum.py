@@ -17,6 +17,7 @@ from ...compiling import compiled
 from ...display.progress import silent
 from ...simulation.integration import reason
 from ..result import Status
+from .arrow import Unknowns
 from .descent import BoundedDescent
 from .filling import Filling
 from .linearising import linearisation
@@ -75,37 +76,63 @@ def minimise(
     """
     if settings.solver is not None:
         return _by_stock_solver(problem, theta, start, settings, say)
-    around, rows, fill = linearisation(problem), np.float64(problem.rows), Filling.of(problem)
-    solver = LevenbergMarquardt(
-        descent=BoundedDescent(fill.ends(problem.lower, -np.inf), fill.ends(problem.upper, np.inf)),
-        tolerance=np.float64(settings.tolerance),
-        worth=np.float64(settings.worth),
-    )
+    around, fill = linearisation(problem), Filling.of(problem)
+
+    def at(y: Unknowns) -> Point:
+        ahead, estimated = fill.emptied(y)
+        return around(ahead, estimated if problem.free_start else start)
+
     theta = np.clip(theta, problem.lower, problem.upper)
-    y = fill.unknowns(problem.unknowns(theta, start))
-    state = solver.init(None, y, None, {}, None, None, frozenset())
     point = around(theta, start) if known is None else known
     if not np.isfinite(point.loss):
         return _unsimulated(point)
+    y, bounds = fill.unknowns(problem.unknowns(theta, start)), (problem.lower, problem.upper)
+    return Minimum(*descend(at, point, y, bounds, fill, problem.rows, settings, say))
+
+
+def descend(
+    at: Callable[[Unknowns], Any],
+    point: Any,
+    y: Unknowns,
+    bounds: tuple[Float[Any, " own"], Float[Any, " own"]],
+    fill: Filling,
+    rows: float,
+    settings: Stopping,
+    say: Callable[[str], None] = silent,
+) -> tuple[Any, Status, int]:
+    """Steps to a minimum of what is evaluated outside the solver, with what was found there.
+
+    **Arguments:**
+
+    - `at`: what there is at some unknowns: anything with `sums` and `loss`.
+    - `point`: what there is at the first of them, `y`, filled up.
+    - `bounds`: of the parameters. `rows`: how many residuals there are.
+    """
+    lower, upper = bounds
+    solver = LevenbergMarquardt(
+        descent=BoundedDescent(fill.ends(lower, -np.inf), fill.ends(upper, np.inf)),
+        tolerance=np.float64(settings.tolerance),
+        worth=np.float64(settings.worth),
+    )
+    state = solver.init(None, y, None, {}, None, None, frozenset())
     trial = point
     for k in range(1, settings.max_steps + 1):
         # On the host, where these few numbers add up without a program for each shape.
         sums, loss = jax.device_get((trial.sums, trial.loss))
         with np.errstate(over="ignore", invalid="ignore"):
-            options = {"linearised": fill.products(sums, loss), "rows": rows}
+            options = {"linearised": fill.products(sums, loss), "rows": np.float64(rows)}
         y, state = _stepped(solver, y, options, state)
         point = trial if state.accepted else point
         ended, result = solver.terminate(None, y, None, options, state, frozenset())
         if ended:
             stalled = result != optx.RESULTS.successful
-            return Minimum(point, Status.stalled if stalled else Status.converged, k)
+            return point, Status.stalled if stalled else Status.converged, k
         if time.perf_counter() > settings.deadline:
-            return Minimum(point, Status.max_seconds, k)
+            return point, Status.max_seconds, k
         if k < settings.max_steps:
-            ahead, estimated = fill.emptied(state.y_eval)
-            trial = around(ahead, estimated if problem.free_start else start)
+            trial = at(state.y_eval)
             say(f"iteration {k + 1}, weighted squared error {float(trial.loss):.6g}")
-    return Minimum(point, Status.max_steps, settings.max_steps)
+    return point, Status.max_steps, settings.max_steps
 
 
 def _unsimulated(point: Point) -> Minimum:

@@ -1,0 +1,178 @@
+"""Best first over sets of effects, each predicted in the linear system."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..effects import AbstractEffect, Curve
+from ..noise import ARFilter
+from .landscape import Entry, Landscape, form, parted
+from .likelihood import score
+from .predict import Prediction
+
+# Difference of scores that decides: odds of 150 to 1.
+DECISIVE = 10.0
+# Sets from which the search goes on, entries and pairs that are added to each.
+_OPEN, _ADDED, _PAIRED = 3, 5, 2
+# Entries whose best pairs are looked for.
+_FIRSTS = 8
+# Share of the best entry's evidence that a shape between those of the grid may make up for.
+_BEHIND = 0.5
+
+
+class Candidate(eqx.Module):
+    """A set of effects, with a free-form curve or without, and its score in the linear system.
+
+    `rest` is what it leaves.
+    """
+
+    effects: tuple[AbstractEffect, ...]
+    score: float
+    noise: tuple[ARFilter, ...]
+    prediction: Prediction
+    rest: Float[np.ndarray, "recordings samples outputs"]
+    curve: Curve | None = None
+
+    @property
+    def key(self) -> tuple:
+        """Which effects are in it, whatever their order and values."""
+        return key_of(self.effects, self.curve)
+
+
+def key_of(effects: Sequence[AbstractEffect], curve: Curve | None = None) -> tuple:
+    """What tells sets of effects apart, but for their values."""
+    given = [*effects, *([] if curve is None else [curve])]
+    return tuple(sorted((form(e) for e in given), key=repr))
+
+
+def explore(
+    landscape: Landscape,
+    most: int,
+    say: Callable[[str], None],
+    there: Sequence[AbstractEffect] = (),
+) -> list[Candidate]:
+    """All sets that were looked at, best first.
+
+    From the best set, and from those that are not decisively behind it, others are made by adding
+    an effect or two, taking one out, putting another in its place, or adding a curve; until no set
+    that is made so is better.
+
+    **Arguments:**
+
+    - `most`: effects of a set at the most. `there`: those that the fitted model has already.
+    """
+    nothing = _candidate(landscape, landscape.predictor.predict(()))
+    seen: dict[tuple, Candidate] = {nothing.key: nothing}
+    opened: set[tuple] = set()
+    while (at := _next(seen, opened)) is not None:
+        opened.add(at.key)
+        for effects in _moves(landscape, seen, at, most, there):
+            if key_of(effects) in seen or parted(effects):
+                continue
+            say(f"set {len(seen)}: {', '.join(e.effect_name() for e in effects)}")
+            found = _candidate(landscape, landscape.predictor.predict(effects))
+            seen[key_of(effects)] = found
+        for curved in _with_curves(landscape, at):
+            seen[curved.key] = curved
+    return _ranked(seen)
+
+
+def _ranked(seen: dict[tuple, Candidate]) -> list[Candidate]:
+    return sorted(seen.values(), key=lambda c: c.score)
+
+
+def _next(seen: dict[tuple, Candidate], opened: set[tuple]) -> Candidate | None:
+    """The best set that is still to be opened; none that does better with less."""
+    plain: list[Candidate] = []
+    for c in _ranked(seen):
+        if (
+            c.curve is None
+            and np.isfinite(c.score)
+            and not any(set(p.key) < set(c.key) for p in plain)
+        ):
+            plain.append(c)
+    near = [c for c in plain[:_OPEN] if c.score < plain[0].score + DECISIVE]
+    return next((c for c in near if c.key not in opened), None)
+
+
+def _candidate(landscape: Landscape, found: Prediction) -> Candidate:
+    if not found.possible:
+        return Candidate(found.effects, np.inf, landscape.predictor.noise, found, found.rest)
+    judged = score(
+        landscape.predictor.data,
+        found.rest,
+        found.freedom,
+        len(found.effects),
+        landscape.forms,
+    )
+    return Candidate(found.effects, judged.value, judged.noise, found, found.rest)
+
+
+def _moves(
+    landscape: Landscape,
+    seen: dict[tuple, Candidate],
+    at: Candidate,
+    most: int,
+    there: Sequence[AbstractEffect],
+) -> Iterator[tuple[AbstractEffect, ...]]:
+    had = Counter(form(e)[:2] for e in (*there, *at.effects))
+    if len(at.effects) < most:
+        entries = _plain(landscape.beside(at.prediction), had)
+        best = entries[0].evidence if entries else 0.0
+        for entry in entries[:_ADDED]:
+            if entry.evidence > max(0.0, _BEHIND * best):
+                yield (*at.effects, entry.effect)
+        if len(at.effects) + 1 < most:
+            pairs = landscape.pairs(at.prediction, entries[:_FIRSTS])
+            pairs = [pair for pair in pairs if _plain(pair, had) == list(pair)]
+            for one, other in pairs[:_PAIRED]:
+                if one.evidence + other.evidence > max(best, 0.0) + DECISIVE:
+                    yield (*at.effects, one.effect, other.effect)
+    for k, gone in enumerate(at.effects):
+        less = (*at.effects[:k], *at.effects[k + 1 :])
+        if not less:
+            continue
+        yield less
+        without = seen.get(key_of(less))
+        if without is None or not without.prediction.possible:
+            continue
+        others = [
+            e
+            for e in _plain(landscape.beside(without.prediction), had)
+            if form(e.effect)[:2] != form(gone)[:2]
+        ]
+        for entry in others[:_PAIRED]:
+            if entry.evidence > 0:
+                yield (*less, entry.effect)
+
+
+def _plain(entries: Sequence[Entry], had: Counter) -> list[Entry]:
+    """Entries of the catalogue; what is there twice already is not added again.
+
+    Two ends of a travel, two harmonics of a ripple: three of a kind come close to something else.
+    """
+    return [e for e in entries if not isinstance(e.effect, Curve) and had[form(e.effect)[:2]] < 2]
+
+
+def _with_curves(landscape: Landscape, at: Candidate) -> list[Candidate]:
+    """The set with each of the curves that explain most beside it."""
+    entries = landscape.beside(at.prediction, _PAIRED, curves=True)
+    return [_curved(landscape, at, e) for e in entries if e.evidence > 0]
+
+
+def _curved(landscape: Landscape, at: Candidate, entry: Entry) -> Candidate:
+    data, noise = landscape.predictor.data, landscape.predictor.noise
+    columns = landscape.data.columns(entry.hypothesis.columns).astype(float)
+    wide = np.concatenate([data.base, at.prediction.moved, columns], axis=-1)
+    white: Any = data.white(wide, noise).reshape(-1, wide.shape[-1])
+    left = data.white(at.prediction.rest, noise).reshape(-1)
+    taken = np.linalg.lstsq(white, left, rcond=1e-12)[0]
+    rest = (at.prediction.rest - wide @ taken) * data.mask[..., None]
+    freedom = at.prediction.freedom + columns.shape[-1]
+    judged = score(data, rest, freedom, len(at.effects) + 1, landscape.forms)
+    assert isinstance(entry.effect, Curve)
+    return Candidate(at.effects, judged.value, judged.noise, at.prediction, rest, entry.effect)

@@ -1,0 +1,149 @@
+"""Every hypothesis held against what a set of effects leaves in the linear system."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..effects import AbstractEffect, AbstractTransmission, Curve
+from ..noise import ARFilter
+from ..parameters import write_values
+from .hypotheses import Hypothesis, amplitudes
+from .predict import Prediction, Predictor
+from .score import WEAK, Data, Gram, Whitened, by_width, explained_by
+from .system import System
+
+
+class Entry(eqx.Module):
+    """A hypothesis beside a set of effects: what more it would explain, less its price."""
+
+    hypothesis: Hypothesis
+    evidence: float
+    effect: AbstractEffect
+
+
+class Landscape(eqx.Module):
+    """The table of signatures as noise lets it be seen, with the system that they are of."""
+
+    predictor: Predictor
+    data: Data
+    hypotheses: tuple[Hypothesis, ...]
+    white: Whitened
+    gram: Gram
+
+    @classmethod
+    def of(
+        cls, system: System, data: Data, hypotheses: Sequence[Hypothesis], noise: Sequence[ARFilter]
+    ) -> "Landscape":
+        """Of signatures, through noise filters.
+
+        **Arguments:**
+
+        - `data`: with the signatures in its table, and the level of noise in each recording.
+        """
+        predictor = Predictor.of(system, noise, data.level)
+        white = Whitened.of(data, noise)
+        return cls(predictor, data, tuple(hypotheses), white, Gram.of_whitened(white))
+
+    @property
+    def forms(self) -> int:
+        """How many effects there are to choose from, forms and joints counted apart."""
+        return len({form(h.effect) for h in self.hypotheses})
+
+    def beside(self, set_: Prediction | None, most: int = 12, curves: bool = False) -> list[Entry]:
+        """The best setting of each form of effect beside a set, best first.
+
+        **Arguments:**
+
+        - `most`: how many forms. `curves`: free-form curves in place of effects.
+        """
+        return self._entries(*self._left(set_), most, curves)
+
+    def pairs(self, set_: Prediction | None, firsts: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
+        """For each of some entries the one that explains most beside it and the set."""
+        residual, taken = self._left(set_)
+        made = []
+        for first in firsts:
+            own = self.white.signatures[:, list(first.hypothesis.columns)].astype(float)
+            both = np.concatenate([taken, own - taken @ (taken.T @ own)], axis=1)
+            basis = _basis(both)
+            rest = residual - basis @ (basis.T @ residual)
+            others = [
+                e
+                for e in self._entries(rest, basis, 2, False)
+                if form(e.effect)[:2] != form(first.effect)[:2]
+            ]
+            if others:
+                made.append((first, others[0]))
+        return sorted(made, key=lambda pair: -(pair[0].evidence + pair[1].evidence))
+
+    def _left(self, set_: Prediction | None) -> tuple[np.ndarray, np.ndarray]:
+        """What a set leaves of the whitened residual, and directions that it can absorb."""
+        if set_ is None or not set_.effects:
+            return self.white.residual, np.zeros((len(self.white.residual), 0))
+        return set_.residual, _basis(set_.slopes)
+
+    def _entries(
+        self, residual: np.ndarray, taken: np.ndarray, most: int, curves: bool
+    ) -> list[Entry]:
+        x, single = self.white.signatures, self.white.signatures.dtype
+        score = (residual.astype(single) @ x).astype(float)
+        across = (taken.astype(single).T @ x).astype(float)
+        evidence = np.full(len(self.hypotheses), -np.inf)
+        inner: dict[int, np.ndarray] = {}
+        for places, columns in by_width([h.columns for h in self.hypotheses]):
+            part = across[:, columns]
+            gram = self.gram.gram[columns[:, :, None], columns[:, None, :]]
+            gram = gram - np.einsum("kbi,kbj->bij", part, part)
+            value, freedom = explained_by(gram, score[columns][..., None])
+            price = freedom * np.log(self.gram.count)
+            evidence[places] = np.where(freedom > 0, value[:, 0] - price, -np.inf)
+            inner |= dict(zip(places.tolist(), gram, strict=True))
+        evidence -= 2 * np.log([h.tests for h in self.hypotheses])
+        found: dict[tuple, Entry] = {}
+        for place in np.argsort(-evidence).tolist():
+            hypothesis = self.hypotheses[place]
+            if isinstance(hypothesis.effect, Curve) != curves or not np.isfinite(evidence[place]):
+                continue
+            name = form(hypothesis.effect)
+            if name in found:
+                continue
+            at = list(hypothesis.columns)
+            amplitude = np.linalg.pinv(inner[place], rcond=1e-9) @ score[at] / self.gram.size[at]
+            low, high = np.array(hypothesis.lower), np.array(hypothesis.upper)
+            if np.all((amplitude > low) & (amplitude < high)):
+                effect = _sized(hypothesis.effect, amplitude)
+                found[name] = Entry(hypothesis, float(evidence[place]), effect)
+            if len(found) == most:
+                break
+        return list(found.values())
+
+
+def form(effect: AbstractEffect) -> tuple:
+    """What tells one hypothesis from another, but for its setting."""
+    joint, kind = getattr(effect, "joint", None), type(effect).__name__
+    if isinstance(effect, Curve):
+        return effect.effect_name(), joint, (effect.label, effect.signed)
+    return effect.effect_name(), joint, (kind, tuple(getattr(effect, "recordings", ())))
+
+
+def parted(effects: Sequence[AbstractEffect]) -> bool:
+    """Whether two transmissions are on one joint."""
+    joints = [e.joint for e in effects if isinstance(e, AbstractTransmission)]
+    return len(joints) != len(set(joints))
+
+
+def _sized(effect: AbstractEffect, amplitude: Float[np.ndarray, " columns"]) -> AbstractEffect:
+    linear = amplitudes(effect)
+    if not linear:
+        return effect.scaled(float(np.clip(amplitude[0], 0.05, 20.0)))
+    return write_values(effect, linear, jnp.asarray(amplitude))
+
+
+def _basis(x: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows rank"]:
+    size = np.linalg.norm(x, axis=0)
+    kept = x[:, size > 0] / size[size > 0]
+    basis, values, _ = np.linalg.svd(kept, full_matrices=False)
+    return basis[:, values**2 > WEAK]

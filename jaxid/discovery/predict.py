@@ -1,0 +1,210 @@
+"""Sets of effects in the linear system: what a full refit with them would leave.
+
+Along a run the loop is a linear system and an effect a force on it. What the effect's shape, its
+amplitudes, the loop's own parameters and initial states make of the residual is found there: by
+projection for what is linear in the base, by damped Gauss-Newton steps for the rest. No model with
+the effect in it is compiled.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..effects import AbstractEffect
+from ..estimate.minimise import Filling, Stopping, Sums, descend
+from ..noise import ARFilter
+from ..parameters import Bounds, Parameter, list_parameters, read_values, write_values
+from .finite import simulated
+from .linear import at_samples, respond
+from .score import Data
+from .signatures import force_and_slopes
+from .system import System
+
+# Columns that one response has: of fewer, some are zero, so that few programs are compiled.
+_WIDTH = 8
+# Share of a parameter by which finite effects are moved for their derivative.
+_MOVED = 1e-4
+
+
+class Prediction(eqx.Module):
+    """A set of effects at its best in the linear system.
+
+    - `rest`: what is left of the residual.
+    - `residual`: the same whitened, less what the base absorbs. `loss`: its square.
+    - `moved`: what moving each of the effects' values does to the output, and `slopes` the same
+      whitened.
+    - `freedom`: how many values were estimated, the base among them.
+    - `possible`: whether no amplitude ended on a bound, and the loop does not run away.
+    """
+
+    effects: tuple[AbstractEffect, ...]
+    rest: Float[np.ndarray, "recordings samples outputs"]
+    residual: Float[np.ndarray, " rows"]
+    moved: Float[np.ndarray, "recordings samples outputs values"]
+    slopes: Float[np.ndarray, "rows values"]
+    loss: float
+    freedom: int
+    possible: bool
+
+
+class Predictor(eqx.Module):
+    """A linear system as it is seen through noise filters, with the base projected out."""
+
+    system: System
+    data: Data
+    noise: tuple[ARFilter, ...]
+    base: Float[np.ndarray, "rows absorbed"]
+    basis: Float[np.ndarray, "rows rank"]
+
+    @classmethod
+    def of(cls, system: System, noise: Sequence[ARFilter], level: Any = None) -> "Predictor":
+        """Of a system.
+
+        **Arguments:**
+
+        - `noise`: filters, one an output. `level`: of each recording, as in `Data`.
+        """
+        none = np.zeros((*system.residual.shape, 0))
+        data = Data(system.residual, system.base, none, system.mask, level)
+        base = data.white(system.base, noise).reshape(-1, system.base.shape[-1])
+        size = np.linalg.norm(base, axis=0)
+        basis, values, _ = np.linalg.svd(base[:, size > 0] / size[size > 0], full_matrices=False)
+        basis = basis[:, values > 1e-9 * values[0]] if len(values) else basis
+        return cls(system, data, tuple(noise), base, basis)
+
+    def predict(self, effects: Sequence[AbstractEffect], steps: int = 20) -> Prediction:
+        """The effects, from where they are, refined together."""
+        effects = tuple(effects)
+        if not effects:
+            return self._ended(self._reached(()))
+        free = [p for e in effects for p in _free(e)]
+        bounds = Bounds.of(free)
+        first = np.clip(_values(effects), bounds.lower, bounds.upper)
+        fill = Filling(parameters=len(first), recordings=0, estimated=0)
+
+        def at(y) -> "_Reached":
+            return self._reached(_with_values(effects, fill.emptied(y)[0]))
+
+        y = fill.unknowns((first, np.zeros((0, 0))))
+        rows = int(self.data.mask.sum()) * self.data.residual.shape[2]
+        limits = bounds.lower, bounds.upper
+        settings = Stopping(tolerance=0.05, max_steps=steps)
+        found, _, _ = descend(at, at(y), y, limits, fill, rows, settings)
+        return self._ended(found)
+
+    def _reached(self, effects: tuple[AbstractEffect, ...]) -> "_Reached":
+        shown = [self._shown(effect) for effect in effects]
+        none = np.zeros((*self.data.residual.shape, 1))
+        value = sum((s[..., 0] for s in shown), none[..., 0])
+        slopes = np.concatenate([none[..., 1:], *(s[..., 1:] for s in shown)], axis=-1)
+        both = np.concatenate([(self.data.residual - value)[..., None], -slopes], axis=-1)
+        # Where the loop runs away with an effect, no step goes.
+        there = bool(np.isfinite(both).all())
+        both = both if there else np.zeros_like(both)
+        white = self.data.white(both, self.noise).reshape(-1, both.shape[-1])
+        white = white - self.basis @ (self.basis.T @ white)
+        gram = white.T @ white
+        loss = gram[0, 0] if there else np.inf
+        sums = Sums(
+            loss=np.array([loss]),
+            gram=gram[None, 1:, 1:],
+            slope=gram[None, 1:, 0],
+            start_gram=np.zeros((1, 0, 0, 0)),
+            start_slope=np.zeros((1, 0, 0)),
+            cross=np.zeros((1, 0, 0, len(gram) - 1)),
+        )
+        return _Reached(effects, value, slopes, white, sums, np.asarray(loss))
+
+    def _shown(
+        self, effect: AbstractEffect
+    ) -> Float[np.ndarray, "recordings samples outputs columns"]:
+        """What an effect does to the output, and what moving each of its parameters does."""
+        if effect.finite:
+            return self._by_simulation(effect)
+        system = self.system
+        push, noise, rate = force_and_slopes(effect, system.linear.motion, system.left)
+        place = "pull" if effect.on_link and "pull" in system.linear.places else "push"
+        shown = self._through(place, push)
+        if type(effect).read is not AbstractEffect.read:
+            shown = shown + self._through("noise", noise) + self._through("rate", rate)
+        return shown
+
+    def _through(self, place: Any, columns) -> np.ndarray:
+        count = columns.shape[-1]
+        blocks = []
+        for at in range(0, count, _WIDTH):
+            some = columns[..., at : at + _WIDTH]
+            wide = jnp.pad(some, [(0, 0)] * (some.ndim - 1) + [(0, _WIDTH - some.shape[-1])])
+            blocks.append(np.asarray(respond(self.system.linear, place, wide)))
+        return at_samples(self.system.batch, np.concatenate(blocks, axis=-1)[..., :count])
+
+    def _by_simulation(self, effect: AbstractEffect) -> np.ndarray:
+        free = _free(effect)
+        values = np.asarray(read_values(effect, free))
+        scale = np.array([p.declaration.scale for p in free])
+        by = _MOVED * np.maximum(np.abs(values), 1e-3 * scale)
+        moved = [write_values(effect, free, jnp.asarray(values + d)) for d in np.diag(by)]
+        system = self.system
+        runs = simulated(system.loop, system.batch, [effect, *moved], system.row)
+        nominal = np.asarray(system.linear.seen[:, :, system.row])
+        columns = [
+            runs[0] - nominal,
+            *((r - runs[0]) / d for r, d in zip(runs[1:], by, strict=True)),
+        ]
+        return at_samples(system.batch, np.stack(columns, axis=-1))
+
+    def _ended(self, found: "_Reached") -> Prediction:
+        there = np.isfinite(found.loss)
+        left = self.data.residual - (found.value if there else 0.0)
+        white = self.data.white(left, self.noise).reshape(-1)
+        taken = np.linalg.lstsq(self.base, white, rcond=1e-12)[0]
+        rest = (left - self.system.base @ taken) * self.data.mask[..., None]
+        free = [p for e in found.effects for p in _free(e)]
+        values, bounds = _values(found.effects), Bounds.of(free)
+        amplitude = np.array([p.declaration.linear for p in free for _ in range(p.size)], bool)
+        held = (values <= np.asarray(bounds.lower)) | (values >= np.asarray(bounds.upper))
+        return Prediction(
+            effects=found.effects,
+            rest=rest,
+            residual=found.white[:, 0],
+            moved=found.moved,
+            slopes=-found.white[:, 1:],
+            loss=float(found.loss),
+            freedom=self.basis.shape[1] + len(values),
+            possible=bool(there) and not bool(np.any(held & amplitude)),
+        )
+
+
+class _Reached(eqx.Module):
+    """What there is at some values of the effects' parameters."""
+
+    effects: tuple[AbstractEffect, ...]
+    value: np.ndarray
+    moved: np.ndarray
+    white: np.ndarray
+    sums: Sums
+    loss: Float[np.ndarray, ""]
+
+
+def _free(effect: AbstractEffect) -> tuple[Parameter, ...]:
+    return tuple(p for p in list_parameters(effect) if p.declaration.free)
+
+
+def _values(effects: Sequence[AbstractEffect]) -> Float[np.ndarray, " values"]:
+    return np.concatenate([np.zeros(0), *(np.asarray(read_values(e, _free(e))) for e in effects)])
+
+
+def _with_values(
+    effects: tuple[AbstractEffect, ...], values: Float[np.ndarray, " values"]
+) -> tuple[AbstractEffect, ...]:
+    made, at = [], 0
+    for effect in effects:
+        free = _free(effect)
+        count = sum(p.size for p in free)
+        made.append(write_values(effect, free, jnp.asarray(values[at : at + count])))
+        at += count
+    return tuple(made)

@@ -1,0 +1,99 @@
+"""A fitted loop along its recordings, as the linear system that effects act on."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..errors import FitError
+from ..estimate import Fit
+from ..estimate.converge import from_best_starts
+from ..estimate.oem import oem_of
+from ..estimate.pieces import compared_signals, estimated_starts, pieces_of
+from ..simulation.batch import Batch, prepare
+from ..simulation.integration import SIGNALS
+from ..simulation.loop import ClosedLoop
+from ..simulation.steps import with_substeps
+from .comparison import Comparison
+from .linear import Linearised, at_samples, base_columns, linearise, sampled
+from .signatures import left_for_links
+
+
+class System(eqx.Module):
+    """The loop linearised along its runs, and what of the recordings it leaves.
+
+    - `left`: torque that its own effects on the drives leave for the links.
+    - `residual`: measured less simulated at the samples, in the band that is compared.
+    - `base`: what its free parameters, and initial states where they are estimated, do to the
+      output.
+    - `row`: which of `SIGNALS` is compared.
+    """
+
+    loop: ClosedLoop
+    batch: Batch
+    linear: Linearised
+    left: Float[Array, "recordings points joints"]
+    residual: Float[np.ndarray, "recordings samples outputs"]
+    base: Float[np.ndarray, "recordings samples outputs absorbed"]
+    row: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, fit: Fit | Comparison) -> "System":
+        """The system of a fitted loop.
+
+        **Raises:** `FitError` where the loop cannot be simulated.
+        """
+        loop = with_substeps(fit.loop, fit.recordings)
+        output, batch, free = _as_fitted(fit, loop)
+        linear = linearise(loop, batch, output)
+        row = SIGNALS.index(output)
+        residual, base = _residual_and_base(batch, linear, loop, output, free)
+        if not np.isfinite(residual).all() or not np.isfinite(base).all():
+            raise FitError(
+                f"{loop.name} cannot be simulated at its fitted values, so nothing can be held "
+                "against its residual: fit it by OEM first"
+            )
+        left = left_for_links(loop, linear.motion)
+        return cls(loop, batch, linear, left, residual, base, row)
+
+    @property
+    def mask(self) -> Bool[np.ndarray, "recordings samples"]:
+        """Which samples are compared."""
+        return np.asarray(self.batch.kept)
+
+
+def _as_fitted(fit: Fit | Comparison, loop: ClosedLoop) -> tuple[str, Batch, np.ndarray]:
+    """Which output is compared, the batch, and which initial states are free, as in the fit."""
+    method = oem_of(fit)
+    pieces = pieces_of(fit.recordings, method.window)
+    batch = prepare(loop, pieces)
+    free = estimated_starts(method, pieces, batch)
+    if free.any():
+        start, n = getattr(getattr(fit, "optimum", None), "start", None), loop.joints
+        if start is not None and len(start) == len(pieces):
+            batch = dataclasses.replace(batch, q0=start[:, :n], v0=start[:, n:])
+        else:
+            batch = from_best_starts(method, loop, pieces, batch)
+    return compared_signals(method, loop)[0], batch, free
+
+
+def _residual_and_base(
+    batch: Batch, linear: Linearised, loop: ClosedLoop, output: str, free: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    seen = sampled(batch, np.asarray(linear.seen[:, :, {"tau": 0, "q": 1}[output]]))
+    residual = (np.asarray(getattr(batch, output)) - seen) * np.asarray(batch.mask)[..., None]
+    if batch.band is not None:
+        residual = np.asarray(batch.band(jnp.asarray(residual)))
+    p = loop.theta.shape[0]
+    base = at_samples(batch, np.asarray(base_columns(linear, p, bool(free.any()))))
+    if not free.any():
+        return residual, base
+    shared, own = base[..., :p], base[..., p:]
+    blocks = [shared]
+    for k in np.flatnonzero(free):
+        alone = np.zeros_like(own)
+        alone[k] = own[k]
+        blocks.append(alone)
+    return residual, np.concatenate(blocks, axis=-1)
