@@ -153,6 +153,15 @@ def test_what_is_not_worth_knowing_is_not_added(offset_case, offset_story):
     assert offset_story[0].verdict == "explained"
 
 
+@pytest.mark.xdist_group("offset")
+def test_a_search_that_may_add_nothing_says_that_something_is_left(offset_case):
+    fit, held_out = recordings_of(offset_case)
+    found = jaxid.discover(jaxid.scara(), fit, held_out, most=0, progress=False)
+    assert found.unfinished
+    assert len(found.steps) == 1
+    assert "lacks something" in found.sentence
+
+
 def test_effects_share_the_sharpness_that_is_estimated_for_their_joint():
     worn = Stribeck(1, 0.0, 0.02, gamma=5.0)
     loop = jaxid.emps().with_values(gamma1=1.2e4).add(worn)

@@ -145,7 +145,8 @@ class Search:
         at = self._start(loop)
         while True:
             candidates, nothing = self._predicted(at)
-            better = self._verified(at, candidates, nothing)
+            full = len(at.effects) >= self.asked.most
+            better = None if full else self._verified(at, candidates, nothing)
             if better is None and (better := self._without_one(at)) is not None:
                 gone = [n for n in at.names if n not in better.names]
                 self.removed = (*self.removed, *gone)
@@ -191,7 +192,8 @@ class Search:
         data = dataclasses.replace(screened.data, level=diagnosis.data.level)
         landscape = Landscape.of(screened.system, data, screened.hypotheses, diagnosis.noise)
         self.forms = max(self.forms, landscape.forms)
-        left = min(self.asked.most - len(at.effects), _AHEAD)
+        # At the most that was asked, one more is looked for, to say whether something is left.
+        left = min(max(self.asked.most - len(at.effects), 1), _AHEAD)
         candidates = explore(landscape, left, self.say, at.effects)
         plain = next(c for c in candidates if not c.effects and c.curve is None)
         return [c for c in candidates if c is plain or self._matters(at, c, plain)], plain.score
@@ -224,7 +226,7 @@ class Search:
             return had
         self.say(f"fit with {_listed(asked.effects)}")
         fit = self.campaign.piece(
-            f"with {_listed(together)}",
+            _piece(together),
             lambda: self.refits.with_effects(before, asked.effects, asked.noise, promised),
         )
         if not fit.status.simulated or not is_there(fit, before):
@@ -252,7 +254,7 @@ class Search:
         kept = [e for e in loop.effects if not any(e is x for x in at.effects)]
         self.say(f"fit with {_listed(effects)} alone")
         fit = self.campaign.piece(
-            f"with {_listed(effects)}",
+            _piece(effects),
             lambda: self.refits.filtered(loop.with_effects((*kept, *effects)), noise),
         )
         model = Model(self._added(fit), self._score(fit, len(effects)), fit=fit)
@@ -287,7 +289,7 @@ class Search:
         return bool(np.any(changed / many > self.asked.worth / 100 * size))
 
     def _verdict(self, candidates: Sequence[Candidate], nothing: float) -> tuple[Outcome, bool]:
-        unfinished = len(self.at.effects) >= self.asked.most and self.asked.most > 0
+        unfinished = len(self.at.effects) >= self.asked.most
         curved = [c for c in candidates if c.curve is not None and c.score < nothing]
         best = self.visited.ranked()[0]
         if best.curve is not None and best.score < self.at.score - DECISIVE:
@@ -378,6 +380,15 @@ def _forms(seen: dict[tuple, tuple[Screened, Diagnosis]]) -> int:
 
 def _listed(effects: Sequence[AbstractEffect]) -> str:
     return " and ".join(effect_on(*named(e)) for e in effects)
+
+
+def _piece(effects: Sequence[AbstractEffect]) -> str:
+    """The name of a set's refit among saved pieces; forms of one name are told apart."""
+    parts = []
+    for e in effects:
+        name, joint, kind = form(e)
+        parts.append(f"{name} {joint or ''} {kind}")
+    return f"with {', '.join(parts)}"
 
 
 def _notes(steps: Sequence[Step]) -> tuple[str, ...]:
