@@ -21,7 +21,7 @@ from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
 from .comparison import compare
 from .diagnosis import Diagnosis
-from .explore import DECISIVE, Candidate, explore
+from .explore import DECISIVE, Candidate, explore, key_of
 from .hypotheses import effect_on
 from .landscape import Landscape, form
 from .likelihood import score_of
@@ -291,12 +291,14 @@ class Search:
     def _verdict(self, candidates: Sequence[Candidate], nothing: float) -> tuple[Outcome, bool]:
         unfinished = len(self.at.effects) >= self.asked.most
         curved = [c for c in candidates if c.curve is not None and c.score < nothing]
-        best = self.visited.ranked()[0]
-        if best.curve is not None and best.score < self.at.score - DECISIVE:
-            # Effects in a row came close to something that one curve says with less.
-            less = self.visited.fitted(best.effects)
-            if less is not None and set(less.key) < set(self.at.key):
-                self.at = less
+        mine = set(self.at.key)
+        # A curve beside fewer effects: those in a row came close to what it says with less. Beside
+        # the same effects it makes up for what a prediction misses; the last round knows better.
+        rivals = self.visited.ranked(
+            lambda m: m.curve is not None and set(key_of(m.effects)) < mine
+        )
+        if rivals and rivals[0].score < self.at.score - DECISIVE:
+            self.at = self.visited.fitted(rivals[0].effects) or self.at
             return "outside_catalogue", False
         if curved and curved[0].score == min(c.score for c in candidates):
             return "outside_catalogue", False
