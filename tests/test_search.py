@@ -12,7 +12,7 @@ from stories import recordings_of, search_of, with_chain
 import jaxid
 from jaxid.discovery.explore import _plain, key_of
 from jaxid.discovery.hypotheses import Hypothesis
-from jaxid.discovery.landscape import Entry, parted
+from jaxid.discovery.landscape import Entry, shares_a_joint
 from jaxid.discovery.likelihood import price, score, weights
 from jaxid.discovery.models import Model, Visited
 from jaxid.discovery.score import Data
@@ -98,8 +98,8 @@ def test_effect_is_added_twice_at_the_most():
 
 def test_a_joint_has_one_transmission():
     gap, shaft = Backlash(joint=1, gap=0.01), JointElasticity(joint=1, compliance=0.01)
-    assert parted([gap, TorqueOffset(joint=1), shaft])
-    assert not parted([gap, dataclasses.replace(shaft, joint=2)])
+    assert shares_a_joint([gap, TorqueOffset(joint=1), shaft])
+    assert not shares_a_joint([gap, dataclasses.replace(shaft, joint=2)])
 
 
 def test_sets_are_the_same_in_any_order_and_at_any_values():

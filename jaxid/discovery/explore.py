@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ..effects import AbstractEffect, Curve
 from ..noise import ARFilter
-from .landscape import Entry, Landscape, form, parted
+from .landscape import Entry, Landscape, form, shares_a_joint
 from .likelihood import score
 from .predict import Prediction
 
@@ -71,7 +71,7 @@ def explore(
     while (at := _next(seen, opened)) is not None:
         opened.add(at.key)
         for effects in _moves(landscape, seen, at, most, there):
-            if key_of(effects) in seen or parted(effects):
+            if key_of(effects) in seen or shares_a_joint(effects):
                 continue
             say(f"set {len(seen)}: {', '.join(e.effect_name() for e in effects)}")
             found = _candidate(landscape, landscape.predictor.predict(effects))

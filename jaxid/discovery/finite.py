@@ -66,10 +66,15 @@ def simulated(
     - `effects`: each at a finite setting, and none on a joint whose drive and link are parted
       already.
     - `row`: which of `SIGNALS`.
+
+    **Returns:** one `(recordings, points, joints)` for each effect, N·m or N for a torque, rad or m
+    for a position.
     """
     shared = [k for k, e in enumerate(effects) if isinstance(e, _SHARED)]
     groups = [(shared, _together([effects[k] for k in shared]))] if shared else []
-    for places in _alike(effects, set(shared)):
+    others = [k for k in range(len(effects)) if k not in shared]
+    for alike in by_structure([effects[k] for k in others]):
+        places = [others[k] for k in alike]
         groups.append((places, [(effects[k],) for k in places]))
     jobs = []
     for places, settings in groups:
@@ -118,13 +123,13 @@ def _one_of(options: tuple[AbstractTransmission, ...], chosen: int) -> OneOf:
     return OneOf(joint=joint, options=options, chosen=number)  # type: ignore[reportCallIssue]
 
 
-def _alike(effects: Sequence[AbstractEffect], done: set[int]) -> list[list[int]]:
-    """Places of the effects that are left, those of one structure together."""
+def by_structure(effects: Sequence[AbstractEffect]) -> list[list[int]]:
+    """Places of effects of equal structure together: one trace serves all of them."""
     groups: dict[Any, list[int]] = {}
     for k, effect in enumerate(effects):
-        if k not in done:
-            shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(effect))
-            groups.setdefault((jax.tree.structure(effect), shapes), []).append(k)
+        leaves, structure = jax.tree.flatten(effect)
+        key = (structure, tuple(np.shape(leaf) for leaf in leaves))
+        groups.setdefault(key, []).append(k)
     return list(groups.values())
 
 

@@ -45,7 +45,12 @@ def amplitudes(effect: AbstractEffect) -> tuple[Parameter, ...]:
     """The parameters in which the effect is linear; none where it is screened by simulations."""
     if effect.finite:
         return ()
-    return tuple(p for p in list_parameters(effect) if p.declaration.free and p.declaration.linear)
+    return tuple(p for p in free_of(effect) if p.declaration.linear)
+
+
+def free_of(effect: AbstractEffect) -> tuple[Parameter, ...]:
+    """The parameters of an effect that a fit estimates unless told otherwise."""
+    return tuple(p for p in list_parameters(effect) if p.declaration.free)
 
 
 def effect_on(name: str, joint: int | None) -> str:

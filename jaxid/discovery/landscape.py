@@ -12,7 +12,7 @@ from ..noise import ARFilter
 from ..parameters import write_values
 from .hypotheses import Hypothesis, amplitudes
 from .predict import Prediction, Predictor
-from .score import WEAK, Data, Gram, Whitened, by_width, explained_by
+from .score import Data, Gram, Whitened, by_width, explained_by, spanned, strong_directions
 from .system import System
 
 
@@ -49,8 +49,8 @@ class Landscape(eqx.Module):
 
     @property
     def forms(self) -> int:
-        """How many effects there are to choose from, forms and joints counted apart."""
-        return len({form(h.effect) for h in self.hypotheses})
+        """How many effects there are to choose from."""
+        return forms_of(self.hypotheses)
 
     def beside(self, set_: Prediction | None, most: int = 12, curves: bool = False) -> list[Entry]:
         """The best setting of each form of effect beside a set, best first.
@@ -67,8 +67,8 @@ class Landscape(eqx.Module):
         made = []
         for first in firsts:
             own = self.white.signatures[:, list(first.hypothesis.columns)].astype(float)
-            both = np.concatenate([taken, own - taken @ (taken.T @ own)], axis=1)
-            basis = _basis(both)
+            own = strong_directions(own - taken @ (taken.T @ own))
+            basis = np.concatenate([taken, own], axis=1)
             rest = residual - basis @ (basis.T @ residual)
             others = [
                 e
@@ -83,7 +83,7 @@ class Landscape(eqx.Module):
         """What a set leaves of the whitened residual, and directions that it can absorb."""
         if set_ is None or not set_.effects:
             return self.white.residual, np.zeros((len(self.white.residual), 0))
-        return set_.residual, _basis(set_.slopes)
+        return set_.residual, spanned(set_.slopes)
 
     def _entries(
         self, residual: np.ndarray, taken: np.ndarray, most: int, curves: bool
@@ -121,6 +121,11 @@ class Landscape(eqx.Module):
         return list(found.values())
 
 
+def forms_of(hypotheses: Sequence[Hypothesis]) -> int:
+    """How many effects there are to choose from, forms and joints counted apart."""
+    return len({form(h.effect) for h in hypotheses})
+
+
 def form(effect: AbstractEffect) -> tuple:
     """What tells one hypothesis from another, but for its setting."""
     joint, kind = getattr(effect, "joint", None), type(effect).__name__
@@ -129,8 +134,8 @@ def form(effect: AbstractEffect) -> tuple:
     return effect.effect_name(), joint, (kind, tuple(getattr(effect, "recordings", ())))
 
 
-def parted(effects: Sequence[AbstractEffect]) -> bool:
-    """Whether two transmissions are on one joint."""
+def shares_a_joint(effects: Sequence[AbstractEffect]) -> bool:
+    """Whether two transmissions are on one joint, which has room for one."""
     joints = [e.joint for e in effects if isinstance(e, AbstractTransmission)]
     return len(joints) != len(set(joints))
 
@@ -140,10 +145,3 @@ def _sized(effect: AbstractEffect, amplitude: Float[np.ndarray, " columns"]) -> 
     if not linear:
         return effect.scaled(float(np.clip(amplitude[0], 0.05, 20.0)))
     return write_values(effect, linear, jnp.asarray(amplitude))
-
-
-def _basis(x: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows rank"]:
-    size = np.linalg.norm(x, axis=0)
-    kept = x[:, size > 0] / size[size > 0]
-    basis, values, _ = np.linalg.svd(kept, full_matrices=False)
-    return basis[:, values**2 > WEAK]

@@ -17,10 +17,11 @@ from jaxtyping import Float
 from ..effects import AbstractEffect
 from ..estimate.minimise import Filling, Stopping, Sums, descend
 from ..noise import ARFilter
-from ..parameters import Bounds, Parameter, list_parameters, read_values, write_values
+from ..parameters import Bounds, read_values, write_values
 from .finite import simulated
+from .hypotheses import free_of
 from .linear import at_samples, respond
-from .score import Data
+from .score import Data, spanned
 from .signatures import force_and_slopes
 from .system import System
 
@@ -71,17 +72,20 @@ class Predictor(eqx.Module):
         none = np.zeros((*system.residual.shape, 0))
         data = Data(system.residual, system.base, none, system.mask, level)
         base = data.white(system.base, noise).reshape(-1, system.base.shape[-1])
-        size = np.linalg.norm(base, axis=0)
-        basis, values, _ = np.linalg.svd(base[:, size > 0] / size[size > 0], full_matrices=False)
-        basis = basis[:, values > 1e-9 * values[0]] if len(values) else basis
-        return cls(system, data, tuple(noise), base, basis)
+        return cls(system, data, tuple(noise), base, spanned(base))
 
     def predict(self, effects: Sequence[AbstractEffect], steps: int = 20) -> Prediction:
-        """The effects, from where they are, refined together."""
+        """The effects, from where they are, refined together.
+
+        **Arguments:**
+
+        - `effects`: none of them in the system's own loop. `steps`: points that are evaluated at
+          the most.
+        """
         effects = tuple(effects)
         if not effects:
             return self._ended(self._reached(()))
-        free = [p for e in effects for p in _free(e)]
+        free = [p for e in effects for p in free_of(e)]
         bounds = Bounds.of(free)
         first = np.clip(_values(effects), bounds.lower, bounds.upper)
         fill = Filling(parameters=len(first), recordings=0, estimated=0)
@@ -122,7 +126,10 @@ class Predictor(eqx.Module):
     def _shown(
         self, effect: AbstractEffect
     ) -> Float[np.ndarray, "recordings samples outputs columns"]:
-        """What an effect does to the output, and what moving each of its parameters does."""
+        """What an effect does to the output, N·m or N (rad or m in an open loop), and its slopes.
+
+        The first column is the change, the others are its derivatives by the free parameters.
+        """
         if effect.finite:
             return self._by_simulation(effect)
         system = self.system
@@ -143,7 +150,7 @@ class Predictor(eqx.Module):
         return at_samples(self.system.batch, np.concatenate(blocks, axis=-1)[..., :count])
 
     def _by_simulation(self, effect: AbstractEffect) -> np.ndarray:
-        free = _free(effect)
+        free = free_of(effect)
         values = np.asarray(read_values(effect, free))
         scale = np.array([p.declaration.scale for p in free])
         by = _MOVED * np.maximum(np.abs(values), 1e-3 * scale)
@@ -163,7 +170,7 @@ class Predictor(eqx.Module):
         white = self.data.white(left, self.noise).reshape(-1)
         taken = np.linalg.lstsq(self.base, white, rcond=1e-12)[0]
         rest = (left - self.system.base @ taken) * self.data.mask[..., None]
-        free = [p for e in found.effects for p in _free(e)]
+        free = [p for e in found.effects for p in free_of(e)]
         values, bounds = _values(found.effects), Bounds.of(free)
         amplitude = np.array([p.declaration.linear for p in free for _ in range(p.size)], bool)
         held = (values <= np.asarray(bounds.lower)) | (values >= np.asarray(bounds.upper))
@@ -190,12 +197,8 @@ class _Reached(eqx.Module):
     loss: Float[np.ndarray, ""]
 
 
-def _free(effect: AbstractEffect) -> tuple[Parameter, ...]:
-    return tuple(p for p in list_parameters(effect) if p.declaration.free)
-
-
 def _values(effects: Sequence[AbstractEffect]) -> Float[np.ndarray, " values"]:
-    return np.concatenate([np.zeros(0), *(np.asarray(read_values(e, _free(e))) for e in effects)])
+    return np.concatenate([np.zeros(0), *(np.asarray(read_values(e, free_of(e))) for e in effects)])
 
 
 def _with_values(
@@ -203,7 +206,7 @@ def _with_values(
 ) -> tuple[AbstractEffect, ...]:
     made, at = [], 0
     for effect in effects:
-        free = _free(effect)
+        free = free_of(effect)
         count = sum(p.size for p in free)
         made.append(write_values(effect, free, jnp.asarray(values[at : at + count])))
         at += count

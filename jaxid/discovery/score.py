@@ -136,6 +136,19 @@ def _through(
     return out
 
 
+def spanned(x: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows rank"]:
+    """Orthonormal columns of the same span, whatever the units of each column."""
+    size = np.linalg.norm(x, axis=0)
+    basis, values, _ = np.linalg.svd(x[:, size > 0] / size[size > 0], full_matrices=False)
+    return basis[:, values > 1e-9 * values[0]] if len(values) else basis
+
+
+def strong_directions(x: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows rank"]:
+    """Orthonormal columns of the span of signatures, what is next to nothing of them left out."""
+    basis, size, _ = np.linalg.svd(x, full_matrices=False)
+    return basis[:, size**2 > WEAK]
+
+
 class Whitened(eqx.Module):
     """Residual and signatures, whitened, with what the base absorbs projected out.
 
@@ -157,9 +170,7 @@ class Whitened(eqx.Module):
         size = np.sqrt(np.einsum("rc,rc->c", x, x))
         size[size == 0] = 1.0
         x /= size
-        norms = np.linalg.norm(z, axis=0)
-        basis, values, _ = np.linalg.svd(z[:, norms > 0] / norms[norms > 0], full_matrices=False)
-        basis = basis[:, values > 1e-9 * values[0]] if len(values) else basis
+        basis = spanned(z)
         r = r - basis @ (basis.T @ r)
         single = basis.astype(x.dtype)
         across = single.T @ x

@@ -15,15 +15,16 @@ from ..effects import AbstractEffect
 from ..effects import catalogue as known
 from ..errors import FitError
 from ..estimate import OEM, Fit, Status
+from ..noise import ARFilter
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
 from .comparison import compare
-from .diagnosis import Diagnosis
+from .diagnosis import Diagnosis, over_recordings
 from .explore import DECISIVE, Candidate, explore, key_of
 from .hypotheses import effect_on
-from .landscape import Landscape, form
+from .landscape import Landscape, form, forms_of
 from .likelihood import score_of
 from .models import Model, Named, Visited, named
 from .ranking import Screened, judge
@@ -138,7 +139,8 @@ class Search:
         self.level: np.ndarray | None = None
         self.forms = 0
         self.removed: tuple[Named, ...] = ()
-        self.seen: dict[tuple, tuple[Screened, Diagnosis]] = {}
+        self.latest: tuple[Screened, Diagnosis] | None = None
+        self.diagnoses: dict[tuple, Diagnosis] = {}
 
     def run(self, loop: ClosedLoop) -> tuple[Outcome, bool]:
         """Rounds of predicting and verifying, until nothing is better; the verdict follows."""
@@ -162,7 +164,7 @@ class Search:
         first = self.campaign.piece("start", lambda: self.refits.first(loop))
         # A recording along which the first fit runs away is left out of all that follows.
         self.refits = dataclasses.replace(self.refits, recordings=first.recordings)
-        _, diagnosis = self._screened(first)
+        _, diagnosis = self._screened(first, ())
         # Where noise is strongly coloured, plain output error leaves the parameters far off. A
         # filter fitted to the residual itself would take what is missing for noise.
         again = self.campaign.piece(
@@ -170,28 +172,28 @@ class Search:
         )
         again = dataclasses.replace(again, notes=(*first.notes, *again.notes))
         fit = again if again.succeeded else first
-        _, diagnosis = self._screened(fit, ())
-        self.level = diagnosis.data.level
+        self.latest = self._screened(fit, ())
+        self.level = self.latest[1].data.level
         model = Model((), self._score(fit, 0), fit=fit)
         self.visited.add(model)
         return model
 
-    def _screened(self, fit: Fit, effects: Sequence[AbstractEffect] | None = None):
-        """The linear system at a fit with its signatures, and the diagnosis."""
+    def _screened(self, fit: Fit, effects: Sequence[AbstractEffect]) -> tuple[Screened, Diagnosis]:
+        """The linear system at a fit with its signatures, and the diagnosis, which is kept."""
         screened = screen(fit, self.asked.catalogue, self.say)
-        found = screened, judge(fit, screened, self.asked.significance)
-        if effects is not None:
-            self.seen[Model(tuple(effects), 0.0).key] = found
-        return found
+        diagnosis = judge(fit, screened, self.asked.significance)
+        self.forms = max(self.forms, forms_of(screened.hypotheses))
+        self.diagnoses[key_of(effects)] = diagnosis.light()
+        return screened, diagnosis
 
     def _predicted(self, at: Model) -> tuple[list[Candidate], float]:
         """Sets beside a fitted model, best first, and the score of adding nothing."""
         assert at.fit is not None
-        found = self.seen.get(at.key) or self._screened(at.fit, at.effects)
-        screened, diagnosis = found
+        # The tables are large, so that those of the starting model alone are there already.
+        screened, diagnosis = self.latest or self._screened(at.fit, at.effects)
+        self.latest = None
         data = dataclasses.replace(screened.data, level=diagnosis.data.level)
         landscape = Landscape.of(screened.system, data, screened.hypotheses, diagnosis.noise)
-        self.forms = max(self.forms, landscape.forms)
         # At the most that was asked, one more is looked for, to say whether something is left.
         left = min(max(self.asked.most - len(at.effects), 1), _AHEAD)
         candidates = explore(landscape, left, self.say, at.effects)
@@ -269,12 +271,12 @@ class Search:
         return fit.loop.effects[len(start.fit.loop.effects) :]
 
     def _score(self, fit: Fit, size: int) -> float:
-        return score_of(fit, self._level_of(fit), size, self.forms or _forms(self.seen)).value
+        return score_of(fit, self._level_of(fit), size, self.forms).value
 
     def _level_of(self, fit: Fit) -> np.ndarray | None:
         return None if self.level is None or len(self.level) != len(fit.residuals) else self.level
 
-    def _noise(self, fit: Fit):
+    def _noise(self, fit: Fit) -> tuple[ARFilter, ...]:
         return score_of(fit, self._level_of(fit)).noise
 
     def _matters(self, at: Model, c: Candidate, plain: Candidate) -> bool:
@@ -283,10 +285,11 @@ class Search:
         if at.fit.error_percent.to_numpy().max() < 1e-3:
             # Recordings without noise: what is left is the integration's.
             return False
-        size = np.mean([np.linalg.norm(r.tau, axis=0) for r in at.fit.recordings], axis=0)
+        # In units of what the fit leaves, whose relative error is known.
+        left = np.linalg.norm(np.concatenate(at.fit.residuals), axis=0)
         changed = np.linalg.norm((c.rest - plain.rest).reshape(-1, c.rest.shape[-1]), axis=0)
-        many = np.sqrt(len(at.fit.recordings))
-        return bool(np.any(changed / many > self.asked.worth / 100 * size))
+        percent = over_recordings(at.fit.error_percent.to_numpy())
+        return bool(np.any(changed * percent > self.asked.worth * left))
 
     def _verdict(self, candidates: Sequence[Candidate], nothing: float) -> tuple[Outcome, bool]:
         unfinished = len(self.at.effects) >= self.asked.most
@@ -342,10 +345,13 @@ class Search:
         steps = []
         for k, model in enumerate(models):
             assert model.fit is not None
-            _, diagnosis = self.seen.get(model.key) or self._screened(model.fit, model.effects)
+            if model.key not in self.diagnoses:
+                self._screened(model.fit, model.effects)
             held_out = self.asked.held_out
             held = None if held_out is None else compare(model.fit, held_out)
-            step = Step(label="start", fit=model.fit, held_out=held, diagnosis=diagnosis.light())
+            step = Step(
+                label="start", fit=model.fit, held_out=held, diagnosis=self.diagnoses[model.key]
+            )
             if k:
                 added = model.effects[-1]
                 step = dataclasses.replace(
@@ -373,11 +379,6 @@ class Search:
             for (name, joint), m in found
             if m.fit is not None
         )
-
-
-def _forms(seen: dict[tuple, tuple[Screened, Diagnosis]]) -> int:
-    """How many effects there are to choose from, by what was screened last."""
-    return max((len({form(h.effect) for h in s.hypotheses}) for s, _ in seen.values()), default=1)
 
 
 def _listed(effects: Sequence[AbstractEffect]) -> str:

@@ -8,7 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from ..noise import ARFilter, fit_ar
-from .score import WEAK, Blocks, Data, Rows, Whitened, by_width, explained_by
+from .score import (
+    Blocks,
+    Data,
+    Rows,
+    Whitened,
+    by_width,
+    explained_by,
+    strong_directions,
+)
 
 
 class Separated(eqx.Module):
@@ -168,7 +176,7 @@ def select(white: Whitened, blocks: Blocks, most: int = 12, margin: float = 10.0
             break
         chosen.append(best)
         own = x[:, list(blocks[best])]
-        own = _basis(own - taken @ (taken.T @ own))
+        own = strong_directions(own - taken @ (taken.T @ own))
         taken = np.concatenate([taken, own], axis=1)
         across = own.T @ x
         score = score - (own.T @ residual) @ across
@@ -185,9 +193,3 @@ def _inner(
     """Products within each block."""
     rows = x[:, columns.ravel()].T.reshape(*columns.shape, len(x))
     return (rows @ rows.transpose(0, 2, 1)).astype(float)
-
-
-def _basis(x: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows rank"]:
-    """Orthonormal columns of the same span; directions that are next to nothing left out."""
-    basis, size, _ = np.linalg.svd(x, full_matrices=False)
-    return basis[:, size**2 > WEAK]

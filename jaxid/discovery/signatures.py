@@ -13,14 +13,14 @@ from jaxtyping import Array, Float
 from ..compiling import compiled
 from ..effects import AbstractEffect, Motion
 from ..linear_algebra import exponential
-from ..parameters import Parameter, list_parameters, read_values, write_values
+from ..parameters import Parameter, read_values, write_values
 from ..simulation.batch import Batch
 from ..simulation.dynamics import effect_loads
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import each
 from ..simulation.sharing import at_once, taken
-from .finite import simulated
-from .hypotheses import Hypothesis, amplitudes
+from .finite import by_structure, simulated
+from .hypotheses import Hypothesis, amplitudes, free_of
 from .linear import Linearised, respond
 
 
@@ -119,8 +119,16 @@ def _force_by(
 def force_and_slopes(
     effect: AbstractEffect, motion: Motion, left: Float[Array, "recordings points joints"]
 ) -> Forces:
-    """The effect's force on each run as it is, and by each of its free parameters, in columns."""
-    free = tuple(p for p in list_parameters(effect) if p.declaration.free)
+    """What an effect adds along each run, and the slopes of that by its free parameters.
+
+    **Arguments:**
+
+    - `motion`: nominal, `(recordings, points)` first. `left`: torque left for the links, N·m or N.
+
+    **Returns:** torque on the joint, N·m or N, position read, rad or m, and velocity read, rad/s or
+    m/s; the first column is the value, the others are slopes.
+    """
+    free = free_of(effect)
     values = read_values(effect, free)
 
     def of_run(run: Motion, left) -> Forces:
@@ -194,14 +202,9 @@ def _misreads(effect: AbstractEffect) -> bool:
 
 def _grouped(effects: Sequence[AbstractEffect]) -> list[tuple[AbstractEffect, list[int]]]:
     """Effects of equal structure stacked, with their places."""
-    groups: dict[Any, list[int]] = {}
-    for k, effect in enumerate(effects):
-        leaves, structure = jax.tree.flatten(effect)
-        key = (structure, tuple(np.shape(leaf) for leaf in leaves))
-        groups.setdefault(key, []).append(k)
     return [
         (jax.tree.map(lambda *leaves: jnp.stack(leaves), *(effects[k] for k in places)), places)
-        for places in groups.values()
+        for places in by_structure(effects)
     ]
 
 

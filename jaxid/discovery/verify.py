@@ -10,9 +10,10 @@ import numpy as np
 from ..effects import AbstractEffect, Coulomb
 from ..estimate import OEM, Fit, SeparablePEM, Status, fit
 from ..noise import ARFilter
-from ..parameters import Bounds, list_parameters, read_values, write_values
+from ..parameters import Bounds, read_values, write_values
 from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
+from .hypotheses import free_of
 from .likelihood import score_of
 
 # How much too wide a gap is from which a refit begins: where a link flies longest, all that its
@@ -63,28 +64,31 @@ class Refits(eqx.Module):
         starts = [loop]
         held: tuple[str, ...] = ()
         if any(e.finite for e in effects):
-            starts.append(self.unfiltered(loop))
+            starts.append(self.unfiltered(loop, noise).loop)
             held = held_shapes(loop, len(effects))
         if any(e.contact for e in effects):
             for factor in (1.0, _WIDE):
                 scaled = [_inside(e.scaled(factor)) if e.contact else _inside(e) for e in effects]
                 apart = of_one_sign(before.loop.add(*scaled)).free(*held)
-                tried = fit(apart, self.recordings, self.given())
+                tried = self.unfiltered(apart, noise)
                 if tried.status.simulated and tried.status is not Status.misfit:
                     starts.append(tried.loop)
         found = [self.filtered(start, noise) for start in starts]
         best = self.best(found)
         gained = score_of(before).value - score_of(best).value
         if len(starts) == 1 and not promised / _FAR < gained < promised * _FAR:
-            best = self.best([best, self.filtered(self.unfiltered(loop), noise)])
+            best = self.best([best, self.filtered(self.unfiltered(loop, noise).loop, noise)])
         loose = [name for name in held if name not in best.loop.names]
         if loose:
             best = self.best([best, self.filtered(best.loop.free(*loose), noise)])
         return best
 
-    def unfiltered(self, loop: ClosedLoop) -> ClosedLoop:
-        """The loop fitted as if noise were white: filters that knew nothing of an effect bar it."""
-        return fit(loop, self.recordings, self.given()).loop
+    def unfiltered(self, loop: ClosedLoop, noise: Sequence[ARFilter]) -> Fit:
+        """The loop fitted as if noise were white: filters that knew nothing of an effect bar it.
+
+        Output error, by the program that filters need anyway.
+        """
+        return self.filtered(loop, [ARFilter(np.zeros(0), f.variance * f.gain) for f in noise])
 
     def best(self, found: Sequence[Fit]) -> Fit:
         """The likeliest of several fits of one set of effects."""
@@ -96,7 +100,7 @@ def quiet(method: OEM) -> OEM:
     return dataclasses.replace(method, progress=False)
 
 
-def held_shapes(loop: ClosedLoop, last: int = 1) -> tuple[str, ...]:
+def held_shapes(loop: ClosedLoop, last: int) -> tuple[str, ...]:
     """Names of the last effects' parameters that no fit estimates unless told to.
 
     **Arguments:**
@@ -133,7 +137,7 @@ def of_one_sign(loop: ClosedLoop) -> ClosedLoop:
 
 def _inside(effect: AbstractEffect) -> AbstractEffect:
     """The effect with parameters that are on their bounds or beyond moved just inside."""
-    chosen = [p for p in list_parameters(effect) if p.declaration.free]
+    chosen = free_of(effect)
     if not chosen:
         return effect
     values = Bounds.of(chosen).moved_inside(read_values(effect, chosen))
