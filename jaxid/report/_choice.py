@@ -112,8 +112,9 @@ def _rivals(step: Step) -> list[Content]:
                 c.name,
                 c.joint,
                 type(c.fit.loop.effects[-1]).__name__,
-                c.criterion,
-                c.criterion - best,
+                # Scores are large, and what tells them apart is behind the point.
+                f"{c.criterion:.1f}",
+                f"{c.criterion - best:.1f}",
                 ", ".join(f"{x:.2f}" for x in _rms(c)),
             ]
             for c in step.contenders
