@@ -43,13 +43,14 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
     case = build(wanted)
     with tempfile.TemporaryDirectory() as folder:
         fitting, held_out = read_case(Path(folder), case)
-    started = time.perf_counter()
+    started, cpu = time.perf_counter(), time.process_time()
     found = jaxid.discover(start_model(case), fitting, validate=held_out, progress=False)
-    story = {**found.to_dict(), "took": time.perf_counter() - started}
+    took = {"took": time.perf_counter() - started, "cpu": time.process_time() - cpu}
+    story = {**found.to_dict(), **took}
     marks = judge(case, wanted.kind, story)
     record = {"truth": sim.truth(case), "marks": marks, "story": story}
     record["truth"]["classes"] = [type(e).__name__ for e in case.effects]
-    record["steps"] = [_seen(step, case, held_out) for step in found.steps]
+    record["steps"] = [_seen(found, k, case, held_out) for k in range(len(found.steps))]
     record["stepwise"] = _stepwise_marks(case, wanted.kind, fitting)
     record["failed"] = failed(wanted.kind, marks)
     if record["failed"]:
@@ -60,8 +61,11 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
     return record
 
 
-def _seen(step: Any, case: sim.Case, held_out: jaxid.Recordings) -> dict[str, Any]:
+def _seen(
+    found: jaxid.Discovery, k: int, case: sim.Case, held_out: jaxid.Recordings
+) -> dict[str, Any]:
     """What a step of the story looked like from inside, to learn from failures."""
+    step = found.steps[k]
 
     def line(verdict: Any) -> dict[str, Any]:
         effect = verdict.hypothesis.effect
@@ -88,13 +92,9 @@ def _seen(step: Any, case: sim.Case, held_out: jaxid.Recordings) -> dict[str, An
         "ranking": [line(v) for v in step.diagnosis.ranking[:8]],
         "where": [line(v) for v in step.diagnosis.where[:4]],
         "contenders": [
-            {
-                "name": c.name,
-                "joint": c.joint,
-                "criterion": c.criterion,
-                "status": c.fit.status.name,
-            }
-            for c in step.contenders
+            {"name": name, "joint": joint, "criterion": m.score, "status": m.status}
+            for m in (found.contenders(k) if k else ())
+            for name, joint in m.names[-1:]
         ],
     }
 

@@ -14,7 +14,7 @@ from jaxid.discovery.explore import _plain, key_of
 from jaxid.discovery.hypotheses import Hypothesis
 from jaxid.discovery.landscape import Entry, shares_a_joint
 from jaxid.discovery.likelihood import price, score, weights
-from jaxid.discovery.models import Model, Visited
+from jaxid.discovery.models import Model, Visited, probability
 from jaxid.discovery.score import Data
 from jaxid.discovery.verify import of_one_sign
 from jaxid.effects import (
@@ -122,23 +122,23 @@ def test_what_shares_the_weight_is_alike(offset_story):
         Model((), 150.0, fit=fit),
     ):
         visited.add(model)
-    assert visited.alike(chosen, offset, within=6.0) == (("spring", 2),)
+    assert visited.alike(chosen, offset) == (("spring", 2),)
     shares = np.exp([0, -1.5, -10, -2, -25])
     offset_share = (shares[0] + shares[3]) / shares.sum()
-    assert visited.probability(("torque_offset", 2)) == pytest.approx(offset_share)
+    assert probability(visited.weighed(), ("torque_offset", 2)) == pytest.approx(offset_share)
     # A prediction does not take the place of a refit.
-    visited.add(Model((TorqueOffset(joint=2),), 50.0))
+    visited.add(Model((TorqueOffset(joint=2),), 50.0, beyond=1))
     assert visited.fitted([offset]) is chosen
 
 
 @pytest.mark.xdist_group("offset")
 def test_superfluous_effect_is_taken_out_and_a_needed_one_stays(offset_case, offset_story):
     search, start = search_of(offset_case), offset_story[0].steps[0]
-    search.visited.add(Model((), 0.0, fit=start.fit))
+    search._visit((), start.fit)
     offset, drag = TorqueOffset(joint=2), QuadraticDrag(joint=1)
     for effects in ((drag, offset), (offset, drag)):
         last = with_chain(offset_case, start, *effects)[-1].fit
-        at = Model(search._added(last), search._score(last, 2), fit=last)
+        at = search._visit(search._added(last), last)
         left = search._without_one(at)
         assert left is not None
         assert left.names == (("torque_offset", 2),)

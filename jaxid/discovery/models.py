@@ -1,17 +1,32 @@
 """Models that a search has looked at, and what they are worth beside each other."""
 
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Float
 
 from ..effects import AbstractEffect, Curve
 from ..estimate import Fit
+from ..estimate.result import joint_columns
+from ..noise import ARFilter
+from .comparison import Comparison
+from .diagnosis import over_recordings
 from .explore import Candidate, key_of
+from .hypotheses import effect_on
 from .landscape import form
 from .likelihood import weights
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 Named = tuple[str, int | None]
+# Difference of scores up to which a rival has a weight worth naming: odds of 20 to 1.
+LIKELY = 6.0
+# Models that are kept for a story: what is further down the list has no weight.
+_KEPT = 30
 
 
 class Model(eqx.Module):
@@ -19,12 +34,22 @@ class Model(eqx.Module):
 
     - `curve`: a free-form curve that it has beside them.
     - `fit`: its full refit; None where it was predicted only.
+    - `noise`: filters of what it leaves, one an output.
+    - `left`: relative error on the fitted recordings by joint, %.
+    - `beyond`: how many of its effects, and its curve, were predicted beside a fitted model.
+    - `weight`: its posterior weight among all models that were looked at.
+    - `held_out`: its comparison with recordings that no fit has seen, where one was made.
     """
 
     effects: tuple[AbstractEffect, ...]
     score: float
     curve: Curve | None = None
     fit: Fit | None = None
+    noise: tuple[ARFilter, ...] = ()
+    left: Float[np.ndarray, " joints"] | None = None
+    beyond: int = 0
+    weight: float = 0.0
+    held_out: Comparison | None = None
 
     @property
     def key(self) -> tuple:
@@ -35,6 +60,20 @@ class Model(eqx.Module):
     def names(self) -> tuple[Named, ...]:
         """Name and joint of each effect."""
         return tuple(named(e) for e in self.effects)
+
+    @property
+    def status(self) -> str:
+        """How its fit ended, or that it was predicted."""
+        return "predicted" if self.fit is None else self.fit.status.name
+
+    @property
+    def label(self) -> str:
+        """What it has over the starting model, in words."""
+        parts = [effect_on(*named(e)) for e in self.effects]
+        if self.curve is not None:
+            along = f"{self.curve.label}{' and direction' if self.curve.signed else ''}"
+            parts.append(f"curve of {along} on joint {self.curve.joint}")
+        return " + ".join(parts) or "start"
 
 
 def named(effect: AbstractEffect) -> Named:
@@ -49,23 +88,34 @@ class Visited:
         self._models: dict[tuple, Model] = {}
 
     def add(self, model: Model) -> None:
-        """A model; what is known of a refit stays."""
+        """A model; what is known from nearer to a refit stays."""
         had = self._models.get(model.key)
-        if had is None or (model.fit is not None, -model.score) > (had.fit is not None, -had.score):
+        if had is None or (model.beyond, model.score) < (had.beyond, had.score):
             self._models[model.key] = model
 
-    def add_predicted(self, found: Iterable[Candidate], beside: Model, anchor: float) -> None:
+    def add_predicted(
+        self,
+        found: Iterable[Candidate],
+        beside: Model,
+        anchor: float,
+        left: Callable[[Candidate], np.ndarray],
+    ) -> None:
         """Sets predicted beside a fitted model.
 
         **Arguments:**
 
         - `anchor`: what is added to their scores, so that the best of them which was refitted has
           the score of its refit.
+        - `left`: a set's relative error by joint, %.
         """
         for c in found:
             if np.isfinite(c.score) and (c.effects or c.curve is not None):
                 effects = (*beside.effects, *c.effects)
-                self.add(Model(effects, c.score + anchor, c.curve))
+                beyond = len(c.effects) + (c.curve is not None)
+                predicted = Model(
+                    effects, c.score + anchor, c.curve, None, c.noise, left(c), beyond
+                )
+                self.add(predicted)
 
     def fitted(self, effects: Sequence[AbstractEffect]) -> Model | None:
         """The refit of a set, if there is one."""
@@ -76,14 +126,14 @@ class Visited:
         """Models, best first."""
         return sorted(filter(which, self._models.values()), key=lambda m: m.score)
 
-    def alike(self, chosen: Model, effect: AbstractEffect, within: float) -> tuple[Named, ...]:
+    def alike(self, chosen: Model, effect: AbstractEffect) -> tuple[Named, ...]:
         """What could stand in an effect's place in a model, at nearly the same score."""
         rest = list(chosen.effects)
         rest.remove(next(e for e in rest if e is effect))
         kept = sorted((form(e) for e in rest), key=repr)
         found = []
         for model in self.ranked():
-            if model.curve is not None or model.score > chosen.score + within:
+            if model.curve is not None or model.score > chosen.score + LIKELY:
                 continue
             forms = [form(e) for e in model.effects]
             others = [e for e, f in zip(model.effects, forms, strict=True) if f not in kept]
@@ -93,8 +143,49 @@ class Visited:
                 found.append(named(others[0]))
         return tuple(found)
 
-    def probability(self, name: Named) -> float:
-        """Weight of all models that have an effect."""
+    def weighed(self) -> tuple[Model, ...]:
+        """All models with their weights, best first."""
         models = self.ranked()
-        share = weights([m.score for m in models])
-        return float(sum(w for w, m in zip(share, models, strict=True) if name in m.names))
+        shares = weights([m.score for m in models])
+        return tuple(
+            dataclasses.replace(m, weight=float(w)) for m, w in zip(models, shares, strict=True)
+        )
+
+
+def probability(models: Iterable[Model], name: Named) -> float:
+    """Weight of all models that have an effect (Madigan and Raftery 1994)."""
+    return float(sum(m.weight for m in models if name in m.names))
+
+
+def worth_keeping(models: Sequence[Model]) -> tuple[Model, ...]:
+    """The best models and all that were fitted."""
+    return tuple(m for k, m in enumerate(models) if k < _KEPT or m.fit is not None)
+
+
+def compared(models: Sequence[Model]) -> "pd.DataFrame":
+    """Models beside each other: score, difference to the best, weight, errors in %, status."""
+    import pandas as pd
+
+    rows = []
+    for m in models:
+        row: dict[str, Any] = {
+            "model": m.label,
+            "score": m.score,
+            "difference": m.score - models[0].score,
+            "weight": m.weight,
+        }
+        row |= _by_joint("fit", m.left)
+        if m.held_out is not None:
+            row |= _by_joint("held out", over_recordings(m.held_out.error_percent.to_numpy()))
+        rows.append({**row, "status": m.status})
+    table = pd.DataFrame(rows)
+    last = table.pop("status")
+    return table.assign(status=last)
+
+
+def _by_joint(what: str, percent: np.ndarray | None) -> dict[str, float]:
+    values = () if percent is None else percent
+    return {
+        f"{what}, {label}": float(x)
+        for label, x in zip(joint_columns(len(values)), values, strict=True)
+    }

@@ -15,21 +15,21 @@ from ..effects import AbstractEffect
 from ..effects import catalogue as known
 from ..errors import FitError
 from ..estimate import OEM, Fit, Status
-from ..noise import ARFilter
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
 from .comparison import compare
-from .diagnosis import Diagnosis, over_recordings
+from .diagnosis import Diagnosis, over_recordings, share_left
 from .explore import DECISIVE, Candidate, explore, key_of
 from .hypotheses import effect_on
 from .landscape import Landscape, form, forms_of
 from .likelihood import score_of
-from .models import Model, Named, Visited, named
+from .models import Model, Named, Visited, named, probability, worth_keeping
 from .ranking import Screened, judge
 from .screening import screen
-from .story import Contender, Discovery, Outcome, Step
+from .story import Discovery, Step
+from .verdict import Outcome, misfit_of, refuted, undecided
 from .verify import Refits, is_there, quiet
 
 # Sets that are refitted in one round, and the share of what the best gains by which predictions
@@ -38,8 +38,8 @@ _VERIFIED, _INEXACT = 3, 0.08
 # Effects that a fitted model is short of at most: sets of two are predicted to a few per cent of
 # what they explain, larger ones are looked for from the next fit.
 _AHEAD = 2
-# Difference of scores up to which a rival has a weight worth naming: odds of 20 to 1.
-LIKELY = 6.0
+# Weight from which a rival's error on held-out recordings is worth a simulation.
+_SHOWN = 0.01
 
 
 def discover(
@@ -147,8 +147,7 @@ class Search:
         at = self._start(loop)
         while True:
             candidates, nothing = self._predicted(at)
-            full = len(at.effects) >= self.asked.most
-            better = None if full else self._verified(at, candidates, nothing)
+            better = self._verified(at, candidates, nothing)
             if better is None and (better := self._without_one(at)) is not None:
                 gone = [n for n in at.names if n not in better.names]
                 self.removed = (*self.removed, *gone)
@@ -174,9 +173,7 @@ class Search:
         fit = again if again.succeeded else first
         self.latest = self._screened(fit, ())
         self.level = self.latest[1].data.level
-        model = Model((), self._score(fit, 0), fit=fit)
-        self.visited.add(model)
-        return model
+        return self._visit((), fit)
 
     def _screened(self, fit: Fit, effects: Sequence[AbstractEffect]) -> tuple[Screened, Diagnosis]:
         """The linear system at a fit with its signatures, and the diagnosis, which is kept."""
@@ -197,6 +194,7 @@ class Search:
         # At the most that was asked, one more is looked for, to say whether something is left.
         left = min(max(self.asked.most - len(at.effects), 1), _AHEAD)
         candidates = explore(landscape, left, self.say, at.effects)
+        self.seen = at.fit, landscape.predictor.data
         plain = next(c for c in candidates if not c.effects and c.curve is None)
         return [c for c in candidates if c is plain or self._matters(at, c, plain)], plain.score
 
@@ -204,7 +202,7 @@ class Search:
         """The best refit of the sets that promise most; None where none is better."""
         plain = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
         tried: list[Candidate] = []
-        if plain:
+        if plain and len(at.effects) < self.asked.most:
             reach = max(DECISIVE, _INEXACT * (nothing - plain[0].score))
             tried = [c for c in plain if c.score < plain[0].score + reach][:_VERIFIED]
         # Effects that come close to what one curve says better are no explanation.
@@ -215,7 +213,7 @@ class Search:
         better = [pair for pair in found if pair[0].score < limit]
         best = min(better, key=lambda pair: pair[0].score, default=None)
         anchor = at.score - nothing if best is None else best[0].score - best[1].score
-        self.visited.add_predicted(candidates, at, anchor)
+        self.visited.add_predicted(candidates, at, anchor, self._left_by)
         return None if best is None else best[0]
 
     def _fitted(self, at: Model, asked: Candidate, promised: float) -> Model | None:
@@ -233,9 +231,7 @@ class Search:
         )
         if not fit.status.simulated or not is_there(fit, before):
             return None
-        model = Model(self._added(fit), self._score(fit, len(together)), fit=fit)
-        self.visited.add(model)
-        return model
+        return self._visit(self._added(fit), fit)
 
     def _without_one(self, at: Model) -> Model | None:
         """The model without one of its effects, where that is better."""
@@ -252,14 +248,20 @@ class Search:
     def _refitted(self, at: Model, effects: Sequence[AbstractEffect]) -> Model:
         """A part of a fitted model's effects, fitted from where they are."""
         assert at.fit is not None
-        loop, noise = at.fit.loop, self._noise(at.fit)
+        loop, noise = at.fit.loop, at.noise
         kept = [e for e in loop.effects if not any(e is x for x in at.effects)]
         self.say(f"fit with {_listed(effects)} alone")
         fit = self.campaign.piece(
             _piece(effects),
             lambda: self.refits.filtered(loop.with_effects((*kept, *effects)), noise),
         )
-        model = Model(self._added(fit), self._score(fit, len(effects)), fit=fit)
+        return self._visit(self._added(fit), fit)
+
+    def _visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
+        """A fitted model, noted."""
+        judged = score_of(fit, self._level_of(fit), len(effects), self.forms)
+        left = over_recordings(fit.error_percent.to_numpy())
+        model = Model(effects, judged.value, fit=fit, noise=judged.noise, left=left)
         self.visited.add(model)
         return model
 
@@ -270,14 +272,8 @@ class Search:
         assert start.fit is not None
         return fit.loop.effects[len(start.fit.loop.effects) :]
 
-    def _score(self, fit: Fit, size: int) -> float:
-        return score_of(fit, self._level_of(fit), size, self.forms).value
-
     def _level_of(self, fit: Fit) -> np.ndarray | None:
         return None if self.level is None or len(self.level) != len(fit.residuals) else self.level
-
-    def _noise(self, fit: Fit) -> tuple[ARFilter, ...]:
-        return score_of(fit, self._level_of(fit)).noise
 
     def _matters(self, at: Model, c: Candidate, plain: Candidate) -> bool:
         """Whether a set changes what is left of some joint's torque by what is worth knowing."""
@@ -290,6 +286,11 @@ class Search:
         changed = np.linalg.norm((c.rest - plain.rest).reshape(-1, c.rest.shape[-1]), axis=0)
         percent = over_recordings(at.fit.error_percent.to_numpy())
         return bool(np.any(changed * percent > self.asked.worth * left))
+
+    def _left_by(self, c: Candidate) -> np.ndarray:
+        """Relative error by joint that a set predicted in the last round leaves, %."""
+        fit, data = self.seen
+        return over_recordings(fit.error_percent.to_numpy() * share_left(fit, data, c.rest))
 
     def _verdict(self, candidates: Sequence[Candidate], nothing: float) -> tuple[Outcome, bool]:
         unfinished = len(self.at.effects) >= self.asked.most
@@ -311,28 +312,53 @@ class Search:
     # --- the story --------------------------------------------------------------------------------
 
     def story(self, verdict: Outcome, unfinished: bool, started: float) -> Discovery:
-        """What was found, step by step."""
-        steps = self._steps()
-        last = steps[-1].fit
-        explained = verdict == "outside_catalogue" and last.error_percent.min(axis=None) < 99
-        if last.status is Status.misfit and not explained:
-            raise FitError(
-                f"neither {last.loop.name} nor the catalogue explains anything of these "
-                f"recordings: {last.notes[-1]}"
-            )
+        """What was found, step by step, held against recordings that no fit has seen."""
+        models = self.visited.weighed()
+        steps = self._steps(models)
+        models = self._held_out(models, steps)
+        reason = "" if unfinished else self._doubt(verdict, steps, models)
         notes = _notes(steps)
         if unfinished:
             notes = (f"stopped after {self.asked.most} effects, as told: raise most", *notes)
         return Discovery(
-            verdict=verdict,
+            verdict="undetermined" if reason else verdict,
+            reason=reason,
             steps=tuple(steps),
+            considered=worth_keeping(models),
             removed=self.removed,
             notes=notes,
             seconds=time.perf_counter() - started,
             unfinished=unfinished,
         )
 
-    def _steps(self) -> list[Step]:
+    def _doubt(self, verdict: Outcome, steps: Sequence[Step], models: Sequence[Model]) -> str:
+        """Why the verdict cannot be told; empty where it can."""
+        first, last = steps[0], steps[-1]
+        if verdict == "outside_catalogue":
+            # A curve may explain what a model that explains next to nothing lacks.
+            blind = last.fit.status is Status.misfit and last.fit.error_percent.min(axis=None) > 99
+            return misfit_of(last.fit) if blind else ""
+        both = None
+        if first.held_out is not None and last.held_out is not None:
+            both = first.held_out, last.held_out
+        floor = last.diagnosis.floor
+        refutation = refuted(last.fit, self.at.noise, floor, both, self.asked.worth)
+        return refutation or undecided(models, self.at)
+
+    def _held_out(self, models: Sequence[Model], steps: Sequence[Step]) -> tuple[Model, ...]:
+        """Models with their error on held-out recordings, where they are worth the simulation."""
+        known = {id(s.fit): s.held_out for s in steps}
+        held_out = self.asked.held_out
+        found = []
+        for m in models:
+            if m.fit is not None and id(m.fit) in known:
+                m = dataclasses.replace(m, held_out=known[id(m.fit)])
+            elif m.fit is not None and held_out is not None and m.weight > _SHOWN:
+                m = dataclasses.replace(m, held_out=compare(m.fit, held_out))
+            found.append(m)
+        return tuple(found)
+
+    def _steps(self, weighed: Sequence[Model]) -> list[Step]:
         """The starting model, and one more effect in each step."""
         start = self.visited.fitted(())
         assert start is not None
@@ -358,27 +384,11 @@ class Search:
                     step,
                     label=f"+ {effect_on(*named(added))}",
                     added=added,
-                    alike=self.visited.alike(model, added, LIKELY),
-                    contenders=self._contenders(models[k - 1], model),
+                    alike=self.visited.alike(model, added),
+                    probability=probability(weighed, named(added)),
                 )
             steps.append(step)
         return steps
-
-    def _contenders(self, before: Model, chosen: Model) -> tuple[Contender, ...]:
-        """The refits of the same size that have all but one effect in common, the chosen first."""
-        had = {named(e) for e in before.effects}
-        found = [
-            (named(e), m)
-            for m in self.visited.ranked(lambda m: m.fit is not None)
-            if len(m.effects) == len(chosen.effects)
-            for e in m.effects[-1:]
-            if {named(x) for x in m.effects[:-1]} == had
-        ]
-        return tuple(
-            Contender(name=name, joint=joint, fit=m.fit, criterion=m.score)
-            for (name, joint), m in found
-            if m.fit is not None
-        )
 
 
 def _listed(effects: Sequence[AbstractEffect]) -> str:

@@ -5,7 +5,7 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
@@ -15,33 +15,27 @@ from ..display.shown import AbstractShown
 from ..effects import AbstractEffect, Curve
 from ..errors import ModelError
 from ..estimate import Fit
+from ..estimate.oem import oem_of
 from ..simulation.loop import ClosedLoop
 from ..storage.saved import save
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
 from .hypotheses import effect_on, on_recordings
+from .landscape import form
+from .models import Model, compared, named
+from .verdict import Outcome
+from .verify import Refits
 
 if TYPE_CHECKING:
     import pandas as pd
     import plotly.graph_objects as go
 
-Outcome = Literal["adequate", "explained", "outside_catalogue"]
-
-
-class Contender(eqx.Module):
-    """One effect, added and fitted in full; `criterion` is the model's score, less is better."""
-
-    name: str
-    joint: int | None
-    fit: Fit
-    criterion: float
-
 
 class Step(eqx.Module):
     """One turn of the loop: the model so far, and what was found in it.
 
-    `added` is the effect that this step's model has over the last one's; `alike` what these
-    recordings cannot tell from it; `contenders` all that were refitted.
+    `added` is the effect that this step's model has over the last one's; `probability` the weight
+    of all models that have it; `alike` what these recordings cannot tell from it.
     """
 
     label: str
@@ -50,20 +44,24 @@ class Step(eqx.Module):
     diagnosis: Diagnosis
     added: AbstractEffect | None = None
     alike: tuple[tuple[str, int | None], ...] = ()
-    contenders: tuple[Contender, ...] = ()
+    probability: float = 1.0
 
 
 class Discovery(AbstractShown):
     """The story: what the model lacked, step by step, and where it stopped.
 
-    - `verdict`: `"adequate"`, `"explained"` or `"outside_catalogue"`.
+    - `verdict`: `"adequate"`, `"explained"`, `"outside_catalogue"` or `"undetermined"`.
     - `steps`: the first is the starting model.
+    - `reason`: why it is undetermined, and what to do; empty for the other verdicts.
+    - `considered`: the models that were looked at, best first.
     - `removed`: effects that were added and later found not to be needed.
     - `unfinished`: whether it stopped, as told, while an effect of the catalogue was still to add.
     """
 
     verdict: Outcome = eqx.field(static=True)
     steps: tuple[Step, ...]
+    reason: str = eqx.field(static=True, default="")
+    considered: tuple[Model, ...] = ()
     removed: tuple[tuple[str, int | None], ...] = ()
     notes: tuple[str, ...] = eqx.field(static=True, default=())
     seconds: float = eqx.field(static=True, default=0.0)
@@ -88,6 +86,12 @@ class Discovery(AbstractShown):
     def sentence(self) -> str:
         """The verdict in a sentence for a colleague."""
         added = _spoken(self.steps)
+        if self.verdict == "undetermined":
+            best = f"the best model adds {' and '.join(added)}, but " if added else ""
+            return (
+                f"These recordings do not tell what the model of {self.loop.name} lacks: "
+                f"{best}{self.reason}."
+            )
         if self.unfinished and not added:
             return f"The model of {self.loop.name} lacks something, and was to be left as it is."
         if self.verdict == "adequate":
@@ -130,6 +134,61 @@ class Discovery(AbstractShown):
                     row[f"held out, joint {j}"] = x
             rows.append(row)
         return pd.DataFrame(rows).set_index("step")
+
+    @property
+    def models(self) -> "pd.DataFrame":
+        """The models that were looked at, best first, as ArviZ's `compare` has it.
+
+        Score and weight are of the fitted recordings alone. Errors are in %; those on held-out
+        recordings are of models that were fitted in full and are a step of the story or have a
+        weight of a hundredth.
+        """
+        return compared(self.considered)
+
+    def contenders(self, step: int) -> tuple[Model, ...]:
+        """The models with one effect in another's place that were fitted in full, best first.
+
+        **Arguments:**
+
+        - `step`: place in `steps`, from 1.
+        """
+        before = sorted(
+            (named(s.added) for s in self.steps[1:step] if s.added is not None), key=str
+        )
+        return tuple(
+            m
+            for m in self.considered
+            if m.fit is not None
+            and len(m.effects) == step
+            and sorted(m.names[:-1], key=str) == before
+        )
+
+    def choose(self, model: int | str) -> Fit:
+        """Another model of the table `models`, fitted in full.
+
+        **Arguments:**
+
+        - `model`: its row, from 0, or its name.
+
+        **Raises:** `ModelError` where there is no such model.
+        """
+        chosen = _chosen(self.considered, model)
+        if chosen.fit is not None:
+            return chosen.fit
+        there = {form(e) for e in chosen.effects}
+        parts = [
+            m
+            for m in self.considered
+            if m.fit is not None and m.curve is None and {form(e) for e in m.effects} <= there
+        ]
+        before = max(parts, key=lambda m: len(m.effects))
+        assert before.fit is not None
+        had = {form(e) for e in before.effects}
+        more = [e for e in chosen.effects if form(e) not in had]
+        if chosen.curve is not None:
+            more.append(chosen.curve)
+        refits = Refits(before.fit.recordings, oem_of(before.fit))
+        return refits.with_effects(before.fit, more, chosen.noise)
 
     def plot(self) -> "go.Figure":
         """The error falling, step by step, with the noise floor."""
@@ -176,6 +235,7 @@ class Discovery(AbstractShown):
         return {
             "robot": self.loop.name,
             "verdict": self.verdict,
+            "reason": self.reason,
             "unfinished": self.unfinished,
             "ranking": first.diagnosis.to_dict()["ranking"],
             "added": [
@@ -184,6 +244,7 @@ class Discovery(AbstractShown):
                     "joint": getattr(step.added, "joint", None),
                     "recordings": list(getattr(step.added, "recordings", ())),
                     "parameters": _found_parameters(self.steps, k),
+                    "probability": step.probability,
                     "indistinguishable": [{"effect": n, "joint": j} for n, j in step.alike],
                 }
                 for k, step in enumerate(s for s in self.steps if s.added is not None)
@@ -194,6 +255,7 @@ class Discovery(AbstractShown):
             "noise_floor_percent": self.noise_floor_percent().tolist(),
             "sentence": self.sentence,
             "removed": [{"effect": n, "joint": j} for n, j in self.removed],
+            "models": [_told(m, self.considered[0].score) for m in self.considered],
             "notes": list(self.notes),
             "seconds": self.seconds,
         }
@@ -211,7 +273,8 @@ class Discovery(AbstractShown):
                 + f" {p['unit']}"
                 for n, p in values.items()
             )
-            lines.append(f"{step_name(step)}: {shown}")
+            sure = f" (probability {_odds(step.probability)})"
+            lines.append(f"{step_name(step)}{sure}: {shown}")
             if step.alike:
                 others = ", ".join(effect_on(n, j) for n, j in step.alike)
                 lines.append(f"  these recordings cannot tell it from {others}")
@@ -227,6 +290,39 @@ class Discovery(AbstractShown):
             f"{errors.to_html(float_format='%.3f')}<p>noise floor by joint: {floor}</p>"
             f"<ul>{lines}</ul>"
         )
+
+
+def _chosen(models: Sequence[Model], asked: int | str) -> Model:
+    found = models if isinstance(asked, int) else [m for m in models if m.label == asked]
+    place = asked if isinstance(asked, int) else 0
+    if not 0 <= place < len(found):
+        what = f"row {asked}" if isinstance(asked, int) else f"model {asked!r}"
+        raise ModelError(
+            f"there is no {what} among the {len(models)} models of this discovery: "
+            "see the table Discovery.models"
+        )
+    return found[place]
+
+
+def _odds(share: float) -> str:
+    """A probability that is no more certain than its digits."""
+    return "> 0.999" if share > 0.999 else f"{share:.3g}"
+
+
+def _told(model: Model, best: float) -> dict[str, Any]:
+    """A model as plain JSON."""
+    held = model.held_out
+    return {
+        "model": model.label,
+        "effects": [{"effect": n, "joint": j} for n, j in model.names],
+        "curve": None if model.curve is None else model.curve.effect_name(),
+        "score": model.score,
+        "difference": model.score - best,
+        "weight": model.weight,
+        "fit_percent": None if model.left is None else model.left.tolist(),
+        "validate_percent": None if held is None else _rms(held.error_percent).tolist(),
+        "status": model.status,
+    }
 
 
 def _spoken(steps: Sequence[Step]) -> list[str]:

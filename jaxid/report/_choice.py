@@ -1,22 +1,24 @@
 """Why the model's effects were chosen and not their rivals, and what else was asked."""
 
-import numpy as np
+from collections.abc import Sequence
 
 from ..discovery import Discovery
 from ..discovery.diagnosis import Diagnosis, Verdict
-from ..discovery.story import Contender, Step
+from ..discovery.models import Model
+from ..discovery.story import Step
 from ._html import Content, Markup, details, figure, probability, section, table, tag
 
 
 def choice(story: Discovery) -> Markup:
     """Why these effects and not their rivals, step by step."""
     pieces: list[Content] = []
-    for before, step in zip(story.steps, story.steps[1:], strict=False):
+    pairs = zip(story.steps, story.steps[1:], strict=False)
+    for k, (before, step) in enumerate(pairs, start=1):
         assert step.added is not None
         pieces.append(tag("h3", step.label))
         pieces.append(tag("p", _reason(before.diagnosis, step)))
         pieces += _evidence(before.diagnosis)
-        pieces += _rivals(step)
+        pieces += _rivals(step, story.contenders(k))
     if len(story.steps) == 1:
         pieces += _evidence(story.diagnosis)
     for name, joint in story.removed:
@@ -103,21 +105,20 @@ def _unbroken(amplitudes: str) -> str:
     return ", ".join(one.replace(" ", "\u00a0") for one in amplitudes.split(", "))
 
 
-def _rivals(step: Step) -> list[Content]:
+def _rivals(step: Step, contenders: Sequence[Model]) -> list[Content]:
     pieces: list[Content] = []
-    if step.contenders:
-        best = step.contenders[0].criterion
+    if contenders:
+        best = contenders[0].score
         rows = [
             [
-                c.name,
-                c.joint,
-                type(c.fit.loop.effects[-1]).__name__,
+                *m.names[-1],
+                type(m.effects[-1]).__name__,
                 # Scores are large, and what tells them apart is behind the point.
-                f"{c.criterion:.1f}",
-                f"{c.criterion - best:.1f}",
-                ", ".join(f"{x:.2f}" for x in _rms(c)),
+                f"{m.score:.1f}",
+                f"{m.score - best:.1f}",
+                "" if m.left is None else ", ".join(f"{x:.2f}" for x in m.left),
             ]
-            for c in step.contenders
+            for m in contenders
         ]
         said = (
             "The sets of effects that promised most were fitted in full. The score is -2 log of "
@@ -134,10 +135,6 @@ def _rivals(step: Step) -> list[Content]:
     else:
         pieces.append(tag("p", "Nothing else of the catalogue does as well on these recordings."))
     return pieces
-
-
-def _rms(contender: Contender) -> np.ndarray:
-    return np.sqrt(np.mean(contender.fit.error_percent.to_numpy() ** 2, axis=0))
 
 
 def where_table(diagnosis: Diagnosis) -> Markup:

@@ -7,6 +7,7 @@ WORDS = {
     "adequate": "adequate",
     "explained": "explained",
     "outside_catalogue": "outside the catalogue",
+    "undetermined": "undetermined",
 }
 
 

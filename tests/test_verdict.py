@@ -1,0 +1,144 @@
+"""What must speak for a model before a verdict sounds sure."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy
+from stories import recordings_of
+
+import jaxid
+from jaxid.discovery.models import Model
+from jaxid.discovery.verdict import _power, _spread, _through, refuted, undecided
+from jaxid.effects import Spring, TorqueOffset
+from jaxid.noise import ARFilter
+
+pytestmark = pytest.mark.xdist_group("offset")
+WORTH = 0.05
+
+
+@pytest.fixture(scope="module")
+def found(offset_story):
+    return offset_story[0]
+
+
+def asked(story, fit=None, both=None, worth=WORTH) -> str:
+    fit = story.fit if fit is None else fit
+    diagnosis = story.diagnosis
+    return refuted(fit, diagnosis.noise, diagnosis.floor, both, worth)
+
+
+def louder(record: jaxid.Recording, joint: int, share: float) -> jaxid.Recording:
+    """The recording with a slow torque more, as large as a share of the torque's."""
+    slow = np.sin(2 * np.pi * 0.4 * record.time)
+    size = share * np.sqrt(2 * np.mean(record.tau[:, joint - 1] ** 2))
+    tau = record.tau.copy()
+    tau[:, joint - 1] += size * slow
+    return dataclasses.replace(record, tau=tau)
+
+
+def test_a_true_model_is_not_refuted(found):
+    first, last = found.steps[0].held_out, found.steps[-1].held_out
+    assert asked(found, both=(first, last)) == ""
+    assert found.verdict == "explained"
+    assert found.reason == ""
+
+
+def test_held_out_recordings_above_the_noise_refute(found, offset_case):
+    held_out = recordings_of(offset_case)[1]
+    record = louder(held_out[0], 2, 0.2)
+    after = jaxid.compare(found.fit, record)
+    said = asked(found, both=(after, after))
+    assert f"held-out recording {record.name}" in said
+    assert "of joint 2" in said
+    # What the user does not find worth knowing refutes nothing.
+    assert asked(found, both=(after, after), worth=50.0) == ""
+    # Neither does what unsure parameters may do there.
+    unsure = dataclasses.replace(found.fit, covariance=1e6 * found.fit.covariance)
+    assert asked(found, unsure, (after, after)) == ""
+
+
+def test_an_addition_that_raises_the_held_out_error_is_refuted(found):
+    first, last = found.steps[0].held_out, found.steps[-1].held_out
+    said = asked(found, both=(last, first))
+    assert "raised the error of joint" in said
+
+
+def test_a_fit_that_failed_is_no_verdict(found):
+    status = jaxid.Status.misfit
+    assert "check the units" in asked(found, dataclasses.replace(found.fit, status=status))
+    status = jaxid.Status.max_steps
+    assert "did not converge" in asked(found, dataclasses.replace(found.fit, status=status))
+
+
+def test_what_noise_does_not_account_for_is_no_verdict(found):
+    start = found.steps[0]
+    # The starting model lacks the offset, and its floor knows.
+    said = refuted(start.fit, start.diagnosis.noise, start.diagnosis.floor, None, WORTH)
+    assert "neither the catalogue nor a curve" in said
+    assert "of joint 2" in said
+
+
+def test_a_start_that_shares_the_weight_is_undecided():
+    start, rival = Model((), 100.0), Model((TorqueOffset(joint=2),), 98.0)
+    models = [dataclasses.replace(rival, weight=0.73), dataclasses.replace(start, weight=0.27)]
+    assert "only 2 behind" in undecided(models, rival)
+    sure = dataclasses.replace(rival, score=90.0)
+    assert undecided([sure, start], sure) == ""
+    alone = [dataclasses.replace(start, weight=0.9), dataclasses.replace(rival, weight=0.1)]
+    assert undecided(alone, alone[0]) == ""
+    crowd = [dataclasses.replace(start, weight=0.4), Model((Spring(joint=1),), 101, weight=0.3)]
+    assert "spring on joint 1" in undecided(crowd, crowd[0])
+
+
+NOISE = ARFilter(np.array([-1.6, 0.7]), 0.3)
+
+
+def test_spread_of_a_mean_square_is_that_of_drawn_noise():
+    rows = NOISE.simulate((2000, 600), np.random.default_rng(0))
+    power = np.mean(rows**2, axis=1)
+    assert _spread(NOISE, 600) == pytest.approx(power.std() / power.mean(), rel=0.1)
+
+
+def test_power_of_noise_is_known_beside_slow_physics():
+    rows = 3.0 * NOISE.simulate((50, 3000), np.random.default_rng(1))
+    true = 9 * NOISE.variance * NOISE.gain
+    slow = 20 * np.sin(np.arange(3000) * 0.01)
+    found = np.array([_power(NOISE, row) for row in rows])
+    assert found.mean() == pytest.approx(true, rel=0.02)
+    assert found.std() / true == pytest.approx(2 / np.sqrt(3000), rel=0.3)
+    assert _power(NOISE, rows[0] + slow) == pytest.approx(found[0], rel=0.1)
+
+
+def test_variance_of_a_sum_with_noise_is_the_covariance():
+    delta = np.cos(np.arange(200) * 0.1)
+    lags = np.fft.ifft(NOISE.spectrum(4096)).real[:200]
+    exact = delta @ scipy.linalg.toeplitz(lags) @ delta
+    assert _through(NOISE, delta) == pytest.approx(exact, rel=0.01)
+
+
+def test_the_table_of_models_tells_what_each_is_worth(found):
+    table = found.models
+    assert table["difference"].iloc[0] == 0
+    assert table["score"].is_monotonic_increasing
+    assert table["weight"].sum() == pytest.approx(1, abs=1e-6)
+    assert set(table["model"]) >= {"start", found.considered[0].label}
+    chosen = table.iloc[0]
+    held = found.table().iloc[-1]
+    assert chosen["held out, joint 2"] == pytest.approx(held["held out, joint 2"])
+    told = found.to_dict()
+    assert [m["model"] for m in told["models"]] == list(table["model"])
+    assert 0.95 < told["added"][0]["probability"] <= 1
+
+
+def test_another_model_of_the_table_can_be_chosen(found):
+    predicted = [k for k, m in enumerate(found.considered) if m.fit is None]
+    fit = found.choose(predicted[0])
+    assert len(fit.loop.effects) == len(found.steps[0].fit.loop.effects) + 1
+    left = np.sqrt(np.mean(fit.error_percent.to_numpy() ** 2, axis=0))
+    assert left == pytest.approx(found.considered[predicted[0]].left, rel=0.05)
+    assert found.choose("start") is found.steps[0].fit
+    with pytest.raises(jaxid.errors.ModelError, match="no row 999"):
+        found.choose(999)
+    with pytest.raises(jaxid.errors.ModelError, match="no model 'no such'"):
+        found.choose("no such")
