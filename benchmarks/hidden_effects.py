@@ -89,8 +89,8 @@ def _seen(
         "status": step.fit.status.name,
         "theta": values,
         "chi_squared": chi_squared(case, step.fit, held_out),
-        "ranking": [line(v) for v in step.diagnosis.ranking[:8]],
-        "where": [line(v) for v in step.diagnosis.where[:4]],
+        "ranking": [line(v) for v in (step.diagnosis.ranking[:8] if step.diagnosis else ())],
+        "where": [line(v) for v in (step.diagnosis.where[:4] if step.diagnosis else ())],
         "contenders": [
             {"name": name, "joint": joint, "criterion": m.score, "status": m.status}
             for m in (found.contenders(k) if k else ())

@@ -30,9 +30,9 @@ from jaxid.effects import (
 # --- the score ------------------------------------------------------------------------------------
 
 
-def data_of(rest: np.ndarray, level: np.ndarray | None = None) -> Data:
+def data_of(rest: np.ndarray) -> Data:
     none = np.zeros((*rest.shape, 0))
-    return Data(rest, none, none, np.ones(rest.shape[:2], bool), level)
+    return Data(rest, none, none, np.ones(rest.shape[:2], bool))
 
 
 def test_score_of_white_noise_is_its_likelihood_and_the_price():
@@ -64,13 +64,15 @@ def test_a_mean_is_not_taken_off():
     assert score(data_of(rest), rest + 1.0, 0, 0, 10).value > plain + 100
 
 
-def test_recordings_are_held_against_their_own_noise():
+def test_recordings_have_noise_of_their_own_where_it_is_worth_it():
     rng = np.random.default_rng(6)
     rest = rng.standard_normal((2, 800, 1)) * np.array([1.0, 5.0])[:, None, None]
-    level = np.array([[1.0], [5.0]])
-    assert score(data_of(rest, level), rest, 0, 0, 10).noise[0].variance == pytest.approx(
-        1, rel=0.1
-    )
+    power = np.mean(rest[..., 0] ** 2, axis=1)
+    found = score(data_of(rest), rest, 0, 0, 10)
+    assert found.value == pytest.approx(800 * np.log(power).sum() + np.log(1600))
+    assert found.noise[0].variance == pytest.approx(power.mean())
+    alike = rest / np.sqrt(power)[:, None, None]
+    assert score(data_of(rest), alike, 0, 0, 10).value == pytest.approx(0, abs=1e-9)
 
 
 def test_price_of_a_search():

@@ -1,5 +1,6 @@
 """Best first over sets of effects, each predicted in the linear system."""
 
+import dataclasses
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -12,7 +13,7 @@ from ..effects import AbstractEffect, Curve
 from ..noise import ARFilter
 from .landscape import Entry, Landscape, form, shares_a_joint
 from .likelihood import score
-from .predict import Prediction
+from .predict import Prediction, least_squares
 
 # Difference of scores that decides: odds of 150 to 1.
 DECISIVE = 10.0
@@ -20,6 +21,8 @@ DECISIVE = 10.0
 _OPEN, _ADDED, _PAIRED = 3, 5, 2
 # Entries whose best pairs are looked for.
 _FIRSTS = 8
+# Sets whose noise is estimated with them, and turns of that; the others are too far behind.
+_REFINED, _TURNS = 8, 3
 # Share of the best entry's evidence that a shape between those of the grid may make up for.
 _BEHIND = 0.5
 
@@ -27,7 +30,7 @@ _BEHIND = 0.5
 class Candidate(eqx.Module):
     """A set of effects, with a free-form curve or without, and its score in the linear system.
 
-    `rest` is what it leaves.
+    `rest` is what it leaves; `taken` how far the base moved for it; `columns` those of its curve.
     """
 
     effects: tuple[AbstractEffect, ...]
@@ -35,7 +38,20 @@ class Candidate(eqx.Module):
     noise: tuple[ARFilter, ...]
     prediction: Prediction
     rest: Float[np.ndarray, "recordings samples outputs"]
+    taken: Float[np.ndarray, " absorbed"]
     curve: Curve | None = None
+    columns: Float[np.ndarray, "recordings samples outputs knots"] | None = None
+
+    @property
+    def freedom(self) -> int:
+        """How many physical values were estimated."""
+        knots = 0 if self.columns is None else self.columns.shape[-1]
+        return self.prediction.freedom + knots
+
+    @property
+    def size(self) -> int:
+        """How many effects and curves were chosen."""
+        return len(self.effects) + (self.curve is not None)
 
     @property
     def key(self) -> tuple:
@@ -78,7 +94,10 @@ def explore(
             seen[key_of(effects)] = found
         for curved in _with_curves(landscape, at):
             seen[curved.key] = curved
-    return _ranked(seen)
+    ranked = _ranked(seen)
+    near = {c.key for c in ranked[:_REFINED]} | {nothing.key}
+    refined = [_refined(landscape, c) if c.key in near else c for c in ranked]
+    return sorted(refined, key=lambda c: c.score)
 
 
 def _ranked(seen: dict[tuple, Candidate]) -> list[Candidate]:
@@ -100,16 +119,38 @@ def _next(seen: dict[tuple, Candidate], opened: set[tuple]) -> Candidate | None:
 
 
 def _candidate(landscape: Landscape, found: Prediction) -> Candidate:
-    if not found.possible:
-        return Candidate(found.effects, np.inf, landscape.predictor.noise, found, found.rest)
-    judged = score(
-        landscape.predictor.data,
-        found.rest,
-        found.freedom,
-        len(found.effects),
-        landscape.forms,
-    )
-    return Candidate(found.effects, judged.value, judged.noise, found, found.rest)
+    noise = landscape.predictor.noise
+    made = Candidate(found.effects, np.inf, noise, found, found.rest, found.taken)
+    return _scored(landscape, made, found.rest) if found.possible else made
+
+
+def _scored(landscape: Landscape, c: Candidate, rest: np.ndarray) -> Candidate:
+    """A set with what it leaves, and the score of that."""
+    judged = score(landscape.predictor.data, rest, c.freedom, c.size, landscape.forms)
+    return dataclasses.replace(c, score=judged.value, noise=judged.noise, rest=rest)
+
+
+def _refined(landscape: Landscape, c: Candidate) -> Candidate:
+    """A set with its amplitudes, and all that the base absorbs, estimated through its own noise.
+
+    Sets are looked for through one noise for all. A full fit has its own, and with it a likelihood
+    that is larger the more is left to explain.
+    """
+    data = landscape.predictor.data
+    wide = [data.base, c.prediction.moved, *([] if c.columns is None else [c.columns])]
+    columns = np.concatenate(wide, axis=-1).astype(float)
+    moved = c.taken
+    for _ in range(_TURNS if np.isfinite(c.score) else 0):
+        white = data.white(columns, c.noise).reshape(-1, columns.shape[-1])
+        left = data.white(c.rest, c.noise).reshape(-1)
+        low, high = landscape.predictor.limits
+        taken = least_squares(left, white, (low - moved, high - moved))[0]
+        rest = (c.rest - columns @ taken) * data.mask[..., None]
+        better = _scored(landscape, c, rest)
+        if better.score > c.score - 1:
+            break
+        c, moved = better, moved + taken[: len(moved)]
+    return c
 
 
 def _moves(
@@ -170,9 +211,12 @@ def _curved(landscape: Landscape, at: Candidate, entry: Entry) -> Candidate:
     wide = np.concatenate([data.base, at.prediction.moved, columns], axis=-1)
     white: Any = data.white(wide, noise).reshape(-1, wide.shape[-1])
     left = data.white(at.prediction.rest, noise).reshape(-1)
-    taken = np.linalg.lstsq(white, left, rcond=1e-12)[0]
+    low, high = landscape.predictor.limits
+    moved = at.prediction.taken
+    taken = least_squares(left, white, (low - moved, high - moved))[0]
     rest = (at.prediction.rest - wide @ taken) * data.mask[..., None]
-    freedom = at.prediction.freedom + columns.shape[-1]
-    judged = score(data, rest, freedom, len(at.effects) + 1, landscape.forms)
     assert isinstance(entry.effect, Curve)
-    return Candidate(at.effects, judged.value, judged.noise, at.prediction, rest, entry.effect)
+    made = dataclasses.replace(
+        at, curve=entry.effect, columns=columns, taken=moved + taken[: len(moved)]
+    )
+    return _scored(landscape, made, rest)

@@ -36,41 +36,36 @@ def score(
 
     **Arguments:**
 
-    - `data`: which samples there are, and how loud noise is in each recording.
+    - `data`: which samples there are.
     - `rest`: what the model leaves.
     - `freedom`: how many physical values were estimated.
     - `size`: how many effects were chosen, of `offered` that could have been.
     """
-    series = [data.series(rest, j) for j in range(rest.shape[2])]
+    outputs = range(rest.shape[2])
+    series = [[r[m, j] for r, m in zip(rest, data.mask, strict=True)] for j in outputs]
     return _scored(series, freedom, price(size, offered))
 
 
-def score_of(
-    fit: Fit,
-    level: Float[np.ndarray, "recordings outputs"] | None = None,
-    size: int = 0,
-    offered: int = 0,
-) -> Score:
+def score_of(fit: Fit, size: int = 0, offered: int = 0) -> Score:
     """The score of a fit, as `score` has it for what was predicted."""
-    residuals, outputs = fit.residuals, fit.residuals[0].shape[1]
-    alike = np.ones((len(residuals), outputs)) if level is None else level
-    series = [
-        [r[:, j] / loud[j] for r, loud in zip(residuals, alike, strict=True)]
-        for j in range(outputs)
-    ]
+    series = [[r[:, j] for r in fit.residuals] for j in range(fit.residuals[0].shape[1])]
     return _scored(series, len(fit.names), price(size, offered))
 
 
 def _scored(series: Sequence[Sequence[np.ndarray]], freedom: int, paid: float) -> Score:
-    total, value, noise = 0, 0.0, []
+    total, value, noise = sum(len(s) for rows in series for s in rows), 0.0, []
     for rows in series:
         # A mean is the model's to explain, and not taken off.
         found = fit_ar(rows, highest=_HIGHEST, criterion="bic")
-        count = sum(len(s) for s in rows)
-        value += count * math.log(max(found.variance, 1e-300))
+        size = np.array([len(s) for s in rows])
+        # Recordings have noise of levels of their own where that is worth its price.
+        power = np.array([np.mean(found.whiten(s)[found.order :] ** 2) for s in rows])
+        power = np.maximum(power, 1e-300)
+        mean = float(size @ power / size.sum())
+        apart = float(size @ np.log(power)) + (len(rows) - 1) * math.log(total)
+        value += min(size.sum() * math.log(mean), apart)
         freedom += found.order
-        total += count
-        noise.append(found)
+        noise.append(ARFilter(found.coefficients, mean))
     if not math.isfinite(value):
         return Score(math.inf, tuple(noise))
     return Score(value + freedom * math.log(total) + paid, tuple(noise))

@@ -38,6 +38,7 @@ class Prediction(eqx.Module):
     - `residual`: the same whitened, less what the base absorbs. `loss`: its square.
     - `moved`: what moving each of the effects' values does to the output, and `slopes` the same
       whitened.
+    - `taken`: how far the base's values moved.
     - `freedom`: how many values were estimated, the base among them.
     - `possible`: whether no amplitude ended on a bound, and the loop does not run away.
     """
@@ -47,19 +48,24 @@ class Prediction(eqx.Module):
     residual: Float[np.ndarray, " rows"]
     moved: Float[np.ndarray, "recordings samples outputs values"]
     slopes: Float[np.ndarray, "rows values"]
+    taken: Float[np.ndarray, " absorbed"]
     loss: float
     freedom: int
     possible: bool
 
 
 class Predictor(eqx.Module):
-    """A linear system as it is seen through noise filters, with the base projected out."""
+    """A linear system as it is seen through noise filters, with the base projected out.
+
+    `limits` are how far the base's values may move from where they were fitted.
+    """
 
     system: System
     data: Data
     noise: tuple[ARFilter, ...]
     base: Float[np.ndarray, "rows absorbed"]
-    basis: Float[np.ndarray, "rows rank"]
+    limits: tuple[Float[np.ndarray, " absorbed"], Float[np.ndarray, " absorbed"]]
+    rank: int
 
     @classmethod
     def of(cls, system: System, noise: Sequence[ARFilter], level: Any = None) -> "Predictor":
@@ -72,7 +78,13 @@ class Predictor(eqx.Module):
         none = np.zeros((*system.residual.shape, 0))
         data = Data(system.residual, system.base, none, system.mask, level)
         base = data.white(system.base, noise).reshape(-1, system.base.shape[-1])
-        return cls(system, data, tuple(noise), base, spanned(base))
+        loop = system.loop
+        bounds, theta = Bounds.of(loop.free_parameters), np.asarray(loop.theta)
+        free = np.full(base.shape[1] - len(theta), np.inf)
+        lower = np.append(np.minimum(np.asarray(bounds.lower) - theta, 0.0), -free)
+        upper = np.append(np.maximum(np.asarray(bounds.upper) - theta, 0.0), free)
+        rank = spanned(base).shape[1]
+        return cls(system, data, tuple(noise), base, (lower, upper), rank)
 
     def predict(self, effects: Sequence[AbstractEffect], steps: int = 20) -> Prediction:
         """The effects, from where they are, refined together.
@@ -110,7 +122,10 @@ class Predictor(eqx.Module):
         there = bool(np.isfinite(both).all())
         both = both if there else np.zeros_like(both)
         white = self.data.white(both, self.noise).reshape(-1, both.shape[-1])
-        white = white - self.basis @ (self.basis.T @ white)
+        taken, free = least_squares(white[:, 0], self.base, self.limits)
+        white[:, 0] -= self.base @ taken
+        basis = spanned(free)
+        white[:, 1:] -= basis @ (basis.T @ white[:, 1:])
         gram = white.T @ white
         loss = gram[0, 0] if there else np.inf
         sums = Sums(
@@ -121,7 +136,7 @@ class Predictor(eqx.Module):
             start_slope=np.zeros((1, 0, 0)),
             cross=np.zeros((1, 0, 0, len(gram) - 1)),
         )
-        return _Reached(effects, value, slopes, white, sums, np.asarray(loss))
+        return _Reached(effects, value, slopes, white, taken, sums, np.asarray(loss))
 
     def _shown(
         self, effect: AbstractEffect
@@ -167,9 +182,7 @@ class Predictor(eqx.Module):
     def _ended(self, found: "_Reached") -> Prediction:
         there = np.isfinite(found.loss)
         left = self.data.residual - (found.value if there else 0.0)
-        white = self.data.white(left, self.noise).reshape(-1)
-        taken = np.linalg.lstsq(self.base, white, rcond=1e-12)[0]
-        rest = (left - self.system.base @ taken) * self.data.mask[..., None]
+        rest = (left - self.system.base @ found.taken) * self.data.mask[..., None]
         free = [p for e in found.effects for p in free_of(e)]
         values, bounds = _values(found.effects), Bounds.of(free)
         amplitude = np.array([p.declaration.linear for p in free for _ in range(p.size)], bool)
@@ -180,10 +193,40 @@ class Predictor(eqx.Module):
             residual=found.white[:, 0],
             moved=found.moved,
             slopes=-found.white[:, 1:],
+            taken=found.taken,
             loss=float(found.loss),
-            freedom=self.basis.shape[1] + len(values),
+            freedom=self.rank + len(values),
             possible=bool(there) and not bool(np.any(held & amplitude)),
         )
+
+
+def least_squares(
+    left: Float[np.ndarray, " rows"],
+    columns: Float[np.ndarray, "rows columns"],
+    limits: tuple[Float[np.ndarray, " bounded"], Float[np.ndarray, " bounded"]],
+) -> tuple[Float[np.ndarray, " columns"], Float[np.ndarray, "rows free"]]:
+    """Coefficients of a bounded least-squares problem, and the columns that are on no bound.
+
+    **Arguments:**
+
+    - `limits`: of the first columns; the others have none.
+    """
+    size = np.linalg.norm(columns, axis=0)
+    size[size == 0] = 1.0
+    scaled = columns / size
+    lower, upper = (np.full(len(size), x) for x in (-np.inf, np.inf))
+    lower[: len(limits[0])], upper[: len(limits[1])] = limits
+    taken = np.linalg.lstsq(scaled, left, rcond=1e-9)[0]
+    low, high = lower * size, upper * size
+    if np.all((taken >= low) & (taken <= high)):
+        return taken / size, columns
+    import scipy
+
+    q, r = np.linalg.qr(scaled)
+    # An open interval, also for a value that may not move at all.
+    room = 1e-9 * (1 + np.abs(taken).max())
+    found = scipy.optimize.lsq_linear(r, q.T @ left, (low - room, high + room), method="bvls")
+    return np.clip(found.x, low, high) / size, columns[:, found.active_mask == 0]
 
 
 class _Reached(eqx.Module):
@@ -193,6 +236,7 @@ class _Reached(eqx.Module):
     value: np.ndarray
     moved: np.ndarray
     white: np.ndarray
+    taken: np.ndarray
     sums: Sums
     loss: Float[np.ndarray, ""]
 

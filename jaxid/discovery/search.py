@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,13 +25,13 @@ from .diagnosis import Diagnosis, over_recordings, share_left
 from .explore import DECISIVE, Candidate, explore, key_of
 from .hypotheses import effect_on
 from .landscape import Landscape, form, forms_of
-from .likelihood import score_of
+from .likelihood import price, score_of
 from .models import Model, Named, Visited, named, probability, worth_keeping
 from .ranking import Screened, judge
 from .screening import screen
 from .story import Discovery, Step
 from .verdict import Outcome, misfit_of, refuted, undecided
-from .verify import Refits, is_there, quiet
+from .verify import Refits, is_there, needed, quiet
 
 # Sets that are refitted in one round, and the share of what the best gains by which predictions
 # are off.
@@ -136,7 +137,6 @@ class Search:
         self.asked, self.campaign, self.say = asked, campaign, say
         self.refits = Refits(asked.recordings, asked.method)
         self.visited = Visited()
-        self.level: np.ndarray | None = None
         self.forms = 0
         self.removed: tuple[Named, ...] = ()
         self.latest: tuple[Screened, Diagnosis] | None = None
@@ -172,7 +172,6 @@ class Search:
         again = dataclasses.replace(again, notes=(*first.notes, *again.notes))
         fit = again if again.succeeded else first
         self.latest = self._screened(fit, ())
-        self.level = self.latest[1].data.level
         return self._visit((), fit)
 
     def _screened(self, fit: Fit, effects: Sequence[AbstractEffect]) -> tuple[Screened, Diagnosis]:
@@ -204,7 +203,11 @@ class Search:
         tried: list[Candidate] = []
         if plain and len(at.effects) < self.asked.most:
             reach = max(DECISIVE, _INEXACT * (nothing - plain[0].score))
-            tried = [c for c in plain if c.score < plain[0].score + reach][:_VERIFIED]
+            near = [c for c in plain if c.score < plain[0].score + reach]
+            # What does no better with more is looked at again from the fit with less.
+            keys = [Counter(c.key) for c in near]
+            tried = [c for k, c in enumerate(near) if not any(x < keys[k] for x in keys[:k])]
+            tried = tried[:_VERIFIED]
         # Effects that come close to what one curve says better are no explanation.
         alone = [c.score for c in candidates if c.curve is not None and not c.effects]
         gain = nothing - min(alone, default=np.inf)
@@ -237,12 +240,15 @@ class Search:
         """The model without one of its effects, where that is better."""
         if len(at.effects) < 2:
             return None
+        assert at.fit is not None
         found = []
         for gone in at.effects:
+            if needed(at.fit, gone, price(len(at.effects), self.forms)):
+                continue
             less = tuple(e for e in at.effects if e is not gone)
             had = self.visited.fitted(less)
             found.append(had or self._refitted(at, less))
-        best = min(found, key=lambda m: m.score)
+        best = min(found, key=lambda m: m.score, default=at)
         return best if best.score < at.score else None
 
     def _refitted(self, at: Model, effects: Sequence[AbstractEffect]) -> Model:
@@ -259,7 +265,7 @@ class Search:
 
     def _visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
         """A fitted model, noted."""
-        judged = score_of(fit, self._level_of(fit), len(effects), self.forms)
+        judged = score_of(fit, len(effects), self.forms)
         left = over_recordings(fit.error_percent.to_numpy())
         model = Model(effects, judged.value, fit=fit, noise=judged.noise, left=left)
         self.visited.add(model)
@@ -271,9 +277,6 @@ class Search:
         assert start is not None
         assert start.fit is not None
         return fit.loop.effects[len(start.fit.loop.effects) :]
-
-    def _level_of(self, fit: Fit) -> np.ndarray | None:
-        return None if self.level is None or len(self.level) != len(fit.residuals) else self.level
 
     def _matters(self, at: Model, c: Candidate, plain: Candidate) -> bool:
         """Whether a set changes what is left of some joint's torque by what is worth knowing."""
@@ -341,6 +344,7 @@ class Search:
         both = None
         if first.held_out is not None and last.held_out is not None:
             both = first.held_out, last.held_out
+        assert last.diagnosis is not None
         floor = last.diagnosis.floor
         refutation = refuted(last.fit, self.at.noise, floor, both, self.asked.worth)
         return refutation or undecided(models, self.at)
@@ -371,12 +375,13 @@ class Search:
         steps = []
         for k, model in enumerate(models):
             assert model.fit is not None
-            if model.key not in self.diagnoses:
-                self._screened(model.fit, model.effects)
             held_out = self.asked.held_out
             held = None if held_out is None else compare(model.fit, held_out)
             step = Step(
-                label="start", fit=model.fit, held_out=held, diagnosis=self.diagnoses[model.key]
+                label="start",
+                fit=model.fit,
+                held_out=held,
+                diagnosis=self.diagnoses.get(model.key),
             )
             if k:
                 added = model.effects[-1]
@@ -384,11 +389,17 @@ class Search:
                     step,
                     label=f"+ {effect_on(*named(added))}",
                     added=added,
-                    alike=self.visited.alike(model, added),
+                    alike=self._alike(model, added),
                     probability=probability(weighed, named(added)),
                 )
             steps.append(step)
         return steps
+
+    def _alike(self, model: Model, added: AbstractEffect) -> tuple[Named, ...]:
+        """What could stand in an effect's place, when it was added or in the end."""
+        last = next(e for e in self.at.effects if form(e) == form(added))
+        found = (*self.visited.alike(model, added), *self.visited.alike(self.at, last))
+        return tuple(dict.fromkeys(n for n in found if n not in self.at.names))
 
 
 def _listed(effects: Sequence[AbstractEffect]) -> str:

@@ -32,8 +32,9 @@ if TYPE_CHECKING:
 
 
 class Step(eqx.Module):
-    """One turn of the loop: the model so far, and what was found in it.
+    """The model with one more of the effects that were found.
 
+    `diagnosis` is there where the search went on from this model, and for the first and last step.
     `added` is the effect that this step's model has over the last one's; `probability` the weight
     of all models that have it; `alike` what these recordings cannot tell from it.
     """
@@ -41,7 +42,7 @@ class Step(eqx.Module):
     label: str
     fit: Fit
     held_out: Comparison | None
-    diagnosis: Diagnosis
+    diagnosis: Diagnosis | None
     added: AbstractEffect | None = None
     alike: tuple[tuple[str, int | None], ...] = ()
     probability: float = 1.0
@@ -80,7 +81,16 @@ class Discovery(AbstractShown):
     @property
     def diagnosis(self) -> Diagnosis:
         """The diagnosis of the model at the end."""
-        return self.steps[-1].diagnosis
+        found = self.steps[-1].diagnosis
+        assert found is not None
+        return found
+
+    @property
+    def before(self) -> Diagnosis:
+        """The diagnosis of the starting model."""
+        found = self.steps[0].diagnosis
+        assert found is not None
+        return found
 
     @property
     def sentence(self) -> str:
@@ -237,7 +247,7 @@ class Discovery(AbstractShown):
             "verdict": self.verdict,
             "reason": self.reason,
             "unfinished": self.unfinished,
-            "ranking": first.diagnosis.to_dict()["ranking"],
+            "ranking": self.before.to_dict()["ranking"],
             "added": [
                 {
                     "effect": step.added.effect_name(),
@@ -250,7 +260,7 @@ class Discovery(AbstractShown):
                 for k, step in enumerate(s for s in self.steps if s.added is not None)
                 if step.added is not None
             ],
-            "depends_on": last.diagnosis.depends_on() if outside else [],
+            "depends_on": self.diagnosis.depends_on() if outside else [],
             "error_percent": {"before": _errors(first), "after": _errors(last)},
             "noise_floor_percent": self.noise_floor_percent().tolist(),
             "sentence": self.sentence,

@@ -19,6 +19,8 @@ from .likelihood import score_of
 # How much too wide a gap is from which a refit begins: where a link flies longest, all that its
 # contact has shows.
 _WIDE = 10.0
+# How many times what it saves an effect must explain, for no refit without it to be tried.
+_CERTAIN = 3.0
 # Gains that are so many times what was promised, or so many times less, are far from it.
 _FAR = 2.0
 
@@ -142,6 +144,30 @@ def _inside(effect: AbstractEffect) -> AbstractEffect:
         return effect
     values = Bounds.of(chosen).moved_inside(read_values(effect, chosen))
     return write_values(effect, chosen, values)
+
+
+def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
+    """Whether amplitudes are so far from nothing that no refit without the effect can be better.
+
+    **Arguments:**
+
+    - `price`: what the search for effects costs in all.
+    """
+    place = next(k for k, e in enumerate(fit.loop.effects) if e is effect)
+    at, own, count = 0, [], 0
+    for p in fit.loop.free_parameters:
+        if p.place[0] == "effects" and int(p.place[1]) == place:
+            count += p.size
+            own += range(at, at + p.size) if p.declaration.linear else []
+        at += p.size
+    covariance = fit.covariance[np.ix_(own, own)]
+    if effect.finite or not own or not np.isfinite(covariance).all():
+        return False
+    values = fit.theta[own]
+    # The squared error that would be left more (Wald), against what would be saved.
+    lost = float(values @ np.linalg.pinv(covariance) @ values)
+    saved = count * np.log(sum(r.size for r in fit.residuals)) + price
+    return bool(lost > _CERTAIN * saved)
 
 
 def is_there(found: Fit, before: Fit) -> bool:

@@ -16,8 +16,9 @@ def choice(story: Discovery) -> Markup:
     for k, (before, step) in enumerate(pairs, start=1):
         assert step.added is not None
         pieces.append(tag("h3", step.label))
-        pieces.append(tag("p", _reason(before.diagnosis, step)))
-        pieces += _evidence(before.diagnosis)
+        if before.diagnosis is not None:
+            pieces.append(tag("p", _reason(before.diagnosis, step)))
+            pieces += _evidence(before.diagnosis)
         pieces += _rivals(step, story.contenders(k))
     if len(story.steps) == 1:
         pieces += _evidence(story.diagnosis)

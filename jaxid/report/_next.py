@@ -42,7 +42,7 @@ def _experiment(story: Discovery) -> list[Content]:
 def _question(story: Discovery) -> tuple[tuple[Diagnosis, list[Verdict]] | None, str]:
     """Which effects the next recording should set apart, on which diagnosis; and why."""
     for before, step in zip(story.steps, story.steps[1:], strict=False):
-        if not step.alike or step.added is None:
+        if not step.alike or step.added is None or before.diagnosis is None:
             continue
         key = (step.added.effect_name(), getattr(step.added, "joint", None))
         known = {v.key: v for v in before.diagnosis.ranking}
@@ -63,8 +63,11 @@ def _question(story: Discovery) -> tuple[tuple[Diagnosis, list[Verdict]] | None,
         return (story.diagnosis, [leader]), why
     if len(story.steps) == 1:
         return None, "Nothing is missing, so there is nothing to tell apart."
-    before, step = story.steps[-2], story.steps[-1]
+    step = story.steps[-1]
+    # The model before the last effect may never have been linearised.
+    before = next(s for s in story.steps[-2::-1] if s.diagnosis is not None)
     assert step.added is not None
+    assert before.diagnosis is not None
     key = (step.added.effect_name(), getattr(step.added, "joint", None))
     leader = next((v for v in before.diagnosis.ranking if v.key == key), None)
     if leader is None:
