@@ -127,7 +127,7 @@ def test_what_shares_the_weight_is_alike(offset_story):
     assert visited.alike(chosen, offset) == (("spring", 2),)
     shares = np.exp([0, -1.5, -10, -2, -25])
     offset_share = (shares[0] + shares[3]) / shares.sum()
-    assert probability(visited.weighed(), ("torque_offset", 2)) == pytest.approx(offset_share)
+    assert probability(visited.weighed(chosen), ("torque_offset", 2)) == pytest.approx(offset_share)
     # A prediction does not take the place of a refit.
     visited.add(Model((TorqueOffset(joint=2),), 50.0, beyond=1))
     assert visited.fitted([offset]) is chosen

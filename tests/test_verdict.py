@@ -25,7 +25,7 @@ def found(offset_story):
 def asked(story, fit=None, both=None, worth=WORTH) -> str:
     fit = story.fit if fit is None else fit
     diagnosis = story.diagnosis
-    return refuted(fit, diagnosis.noise, diagnosis.floor, both, worth)
+    return refuted(fit, diagnosis.noise, diagnosis, both, worth)
 
 
 def louder(record: jaxid.Recording, joint: int, share: float) -> jaxid.Recording:
@@ -74,7 +74,7 @@ def test_a_fit_that_failed_is_no_verdict(found):
 def test_what_noise_does_not_account_for_is_no_verdict(found):
     start = found.steps[0]
     # The starting model lacks the offset, and its floor knows.
-    said = refuted(start.fit, start.diagnosis.noise, start.diagnosis.floor, None, WORTH)
+    said = refuted(start.fit, start.diagnosis.noise, start.diagnosis, None, WORTH)
     assert "neither the catalogue nor a curve" in said
     assert "of joint 2" in said
 
@@ -89,6 +89,16 @@ def test_a_start_that_shares_the_weight_is_undecided():
     assert undecided(alone, alone[0]) == ""
     crowd = [dataclasses.replace(start, weight=0.4), Model((Spring(joint=1),), 101, weight=0.3)]
     assert "spring on joint 1" in undecided(crowd, crowd[0])
+
+
+def test_a_fit_that_leaves_a_third_says_what_to_check(found):
+    fit, diagnosis = found.fit, found.diagnosis
+    poor = dataclasses.replace(fit, error_percent=40 + 0 * fit.error_percent)
+    slow = [ARFilter(np.array([-0.99]), 1.0)] * 2
+    assert "check the units" in refuted(poor, slow, diagnosis, None, WORTH)
+    # White noise may be as loud.
+    white = [ARFilter(np.zeros(0), 1.0)] * 2
+    assert "check the units" not in refuted(poor, white, diagnosis, None, WORTH)
 
 
 NOISE = ARFilter(np.array([-1.6, 0.7]), 0.3)

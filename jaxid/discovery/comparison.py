@@ -71,11 +71,13 @@ class Comparison(AbstractShown):
         record, run = self.recordings[k], self.runs[k]
         if self.signal == "position":
             return record.time, record.q, np.asarray(run.q)
-        pair = (record.tau, np.asarray(run.tau))
-        measured, simulated = (compared(self.loop, [record], [x])[0] for x in pair)
-        band = band_of(self.loop, [record])
-        kept = slice(None) if band is None else np.asarray(band.keep)[0]
-        return record.time[kept], measured, simulated
+        band = band_of(self.loop, self.recordings)
+        if band is None:
+            return record.time, record.tau, np.asarray(run.tau)
+        pair = [r.tau for r in self.recordings], [np.asarray(x.tau) for x in self.runs]
+        measured, simulated = (compared(self.loop, self.recordings, x)[k] for x in pair)
+        rows = np.asarray(band.rows)[k][np.asarray(band.keep)[k]]
+        return record.time[rows], measured, simulated
 
     @property
     def residuals(self) -> tuple[Float[np.ndarray, "_samples joints"], ...]:

@@ -16,8 +16,6 @@ from ..display.shown import AbstractShown
 from ..effects import AbstractEffect, Curve, Motion, Scene
 from ..errors import FitError
 from ..estimate import Fit
-from ..estimate.oem import oem_of
-from ..estimate.pieces import pieces_of
 from ..noise import ARFilter
 from ..parameters import write_values
 from ..storage.saved import save
@@ -59,6 +57,8 @@ class Diagnosis(AbstractShown):
     - `where`: free-form curves of every coordinate, best first.
     - `pair`: two entries that together explain more than the best curve, where none does alone.
     - `noise`: the noise filter of each output.
+    - `floor`: relative error that a model with every effect and curve that matters leaves, %.
+    - `unexplained`: by how much that model's score is better than that of the fit.
     """
 
     fit: Fit | Comparison
@@ -74,6 +74,7 @@ class Diagnosis(AbstractShown):
     floor: Float[np.ndarray, "recordings joints"]
     tests: float
     significance: float = 0.01
+    unexplained: float = 0.0
 
     @property
     def best(self) -> AbstractEffect:
@@ -216,9 +217,8 @@ class Diagnosis(AbstractShown):
         for verdict in self.ranking[:contenders]:
             rest = leftover(self.data, self.noise, verdict.hypothesis.columns)
             shares[_label(verdict)] = (self.data.residual - rest)[recording, keep, joint - 1]
-        record = pieces_of(self.fit.recordings, oem_of(self.fit).window)[recording]
         residual = self.data.residual[recording, keep, joint - 1]
-        time = record.time[keep[: record.samples]]
+        time = np.asarray(self.motion.t)[recording, keep]
         unit = self.fit.loop.arm.units()[0][joint - 1]
         return figures.shares_in_time(time, residual, shares, unit=unit)
 

@@ -170,4 +170,11 @@ def at_samples(batch: Batch, x: Float[np.ndarray, "recordings points *axes"]) ->
     x = sampled(batch, x)
     mask = np.asarray(batch.mask).reshape(*batch.mask.shape, *(1,) * (x.ndim - 2))
     x = x * mask.astype(x.dtype)
-    return x if batch.band is None else np.asarray(batch.band(jnp.asarray(x)), x.dtype)
+    return np.asarray(batch.compared(x), x.dtype)
+
+
+def at_rows(batch: Batch, tree: Any) -> Any:
+    """Leaves of `(recordings, points, ...)` as they are, at the rows that are compared."""
+    if batch.band is None:
+        return sampled(batch, tree)
+    return jax.tree.map(batch.band.picked, sampled(batch, tree))

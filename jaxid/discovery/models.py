@@ -1,6 +1,7 @@
 """Models that a search has looked at, and what they are worth beside each other."""
 
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -143,9 +144,18 @@ class Visited:
                 found.append(named(others[0]))
         return tuple(found)
 
-    def weighed(self) -> tuple[Model, ...]:
-        """All models with their weights, best first."""
-        models = self.ranked()
+    def weighed(self, chosen: Model) -> tuple[Model, ...]:
+        """All models with their weights, best first.
+
+        Sets that have all of the chosen one's effects are known from its own linear system; what
+        was predicted of them from further away is out of date.
+        """
+
+        def known(m: Model) -> bool:
+            more = len(m.effects) + (m.curve is not None) - len(chosen.effects)
+            return m.beyond <= more or Counter(chosen.key) - Counter(m.key) != Counter()
+
+        models = self.ranked(known)
         shares = weights([m.score for m in models])
         return tuple(
             dataclasses.replace(m, weight=float(w)) for m, w in zip(models, shares, strict=True)

@@ -13,7 +13,8 @@ from ..estimate import Fit
 from .comparison import Comparison
 from .diagnosis import Diagnosis, Verdict, share_left
 from .hypotheses import Hypothesis
-from .linear import sampled
+from .likelihood import score
+from .linear import at_rows
 from .score import Data, Gram, chance, corrected, effective_tests
 from .separate import columns_of, estimate_noise, leftover
 from .system import System
@@ -47,7 +48,7 @@ def judge(fit: Fit | Comparison, screened: Screened, significance: float) -> Dia
 
 def _judged(fit: Fit | Comparison, screened: Screened, significance: float) -> Diagnosis:
     data, hypotheses = screened.data, list(screened.hypotheses)
-    motion = sampled(screened.system.batch, screened.system.linear.motion)
+    motion = at_rows(screened.system.batch, screened.system.linear.motion)
     blocks = [h.columns for h in hypotheses]
     windows = len(data.residual) != len(fit.recordings)
     apart = estimate_noise(data.middle(_ENOUGH), blocks, alike=windows)
@@ -66,6 +67,10 @@ def _judged(fit: Fit | Comparison, screened: Screened, significance: float) -> D
         _keep_better(ranking, verdict.key, verdict)
         _keep_better(forms, (*verdict.key, type(effect)), verdict)
     columns = columns_of(blocks, apart.chosen)
+    rich = leftover(data, noise, columns)
+    absorbed = data.base.shape[-1]
+    plain = score(data, data.residual, absorbed, 0, len(blocks))
+    with_all = score(data, rich, absorbed + len(columns), len(apart.chosen), len(blocks))
     best = tuple(sorted(ranking.values(), key=_order, reverse=True))
     curves = tuple(sorted(where.values(), key=_order, reverse=True))
     return Diagnosis(
@@ -79,9 +84,10 @@ def _judged(fit: Fit | Comparison, screened: Screened, significance: float) -> D
         gram=gram,
         scene=screened.scene,
         motion=motion,
-        floor=_floor(fit, data, leftover(data, noise, columns), len(columns)),
+        floor=_floor(fit, data, rich, len(columns)),
         tests=tests,
         significance=significance,
+        unexplained=plain.value - with_all.value,
     )
 
 

@@ -11,12 +11,11 @@ from ..effects import AbstractTransmission
 from ..effects import catalogue as known
 from ..errors import FitError
 from ..estimate import Fit
-from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
 from .comparison import Comparison
 from .diagnosis import Diagnosis
 from .hypotheses import Hypothesis, candidates, curves, survey
-from .linear import at_samples
+from .linear import at_rows, at_samples
 from .ranking import Screened, judge
 from .score import Data
 from .signatures import signatures
@@ -63,7 +62,8 @@ def screen(fit: Fit | Comparison, catalogue: Sequence[Any], say: Callable[[str],
     say("linearising along the recordings")
     system = System.of(fit)
     loop, linear = system.loop, system.linear
-    tones, trials = _tones(system.residual, system.mask, fit.recordings)
+    time = np.asarray(at_rows(system.batch, linear.motion.t))
+    tones, trials = _tones(system.residual, system.mask, float(np.median(np.diff(time[0]))))
     scene = survey(loop, fit.recordings, linear.motion, tones)
     proposed = candidates(catalogue, scene, trials)
     parted = {e.joint for e in loop.effects if isinstance(e, AbstractTransmission)}
@@ -107,10 +107,9 @@ def _check_finite(
 
 
 def _tones(
-    residual: np.ndarray, mask: np.ndarray, recordings: Recordings, most: int = 4
+    residual: np.ndarray, mask: np.ndarray, period: float, most: int = 4
 ) -> tuple[list[list[float]], float]:
     """Frequencies that stand out of each joint's spectrum, and how many they were picked from."""
-    period = recordings.common_period()
     n = residual.shape[1]
     f = np.fft.rfftfreq(4 * n, period)
     usable = (f > 2 / (n * period)) & (f < 0.4 / period)

@@ -316,7 +316,7 @@ class Search:
 
     def story(self, verdict: Outcome, unfinished: bool, started: float) -> Discovery:
         """What was found, step by step, held against recordings that no fit has seen."""
-        models = self.visited.weighed()
+        models = self.visited.weighed(self.at)
         steps = self._steps(models)
         models = self._held_out(models, steps)
         reason = "" if unfinished else self._doubt(verdict, steps, models)
@@ -345,8 +345,8 @@ class Search:
         if first.held_out is not None and last.held_out is not None:
             both = first.held_out, last.held_out
         assert last.diagnosis is not None
-        floor = last.diagnosis.floor
-        refutation = refuted(last.fit, self.at.noise, floor, both, self.asked.worth)
+        worth = self.asked.worth
+        refutation = refuted(last.fit, self.at.noise, last.diagnosis, both, worth)
         return refutation or undecided(models, self.at)
 
     def _held_out(self, models: Sequence[Model], steps: Sequence[Step]) -> tuple[Model, ...]:

@@ -3,7 +3,6 @@
 import dataclasses
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -84,8 +83,7 @@ def _residual_and_base(
 ) -> tuple[np.ndarray, np.ndarray]:
     seen = sampled(batch, np.asarray(linear.seen[:, :, {"tau": 0, "q": 1}[output]]))
     residual = (np.asarray(getattr(batch, output)) - seen) * np.asarray(batch.mask)[..., None]
-    if batch.band is not None:
-        residual = np.asarray(batch.band(jnp.asarray(residual)))
+    residual = np.asarray(batch.compared(residual))
     p = loop.theta.shape[0]
     base = at_samples(batch, np.asarray(base_columns(linear, p, bool(free.any()))))
     if not free.any():

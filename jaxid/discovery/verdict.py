@@ -10,7 +10,8 @@ from ..estimate import Fit, Status
 from ..estimate.result import joint_columns
 from ..noise import ARFilter
 from .comparison import Comparison
-from .diagnosis import over_recordings
+from .diagnosis import Diagnosis, over_recordings
+from .explore import DECISIVE
 from .models import LIKELY, Model
 from .system import System
 
@@ -21,6 +22,9 @@ Outcome = Literal["adequate", "explained", "outside_catalogue", "undetermined"]
 _REFUTED = 1.10
 # Standard deviations that such an excess must be above chance.
 _SURE = 4.0
+# Share of a joint's torque in % that a model of a robot does not leave, and power of a residual
+# over that of its innovations from which it is no white noise.
+_THIRD, _COLOURED = 33.0, 1.5
 # Probability that the starting model must have, for nothing to be missing.
 _HALF = 0.5
 # Deviations by which the error on held-out recordings must rise to speak against what was added.
@@ -57,7 +61,7 @@ def undecided(models: Sequence[Model], chosen: Model) -> str:
 def refuted(
     chosen: Fit,
     noise: Sequence[ARFilter],
-    floor: Float[np.ndarray, "recordings joints"],
+    diagnosis: Diagnosis,
     held_out: tuple[Comparison, Comparison] | None,
     worth: float,
 ) -> str:
@@ -67,7 +71,7 @@ def refuted(
 
     - `chosen`: the fit of the model of the best score.
     - `noise`: filters of what the chosen model leaves, one an output.
-    - `floor`: what a rich model would leave of the fitted recordings, %.
+    - `diagnosis`: of the chosen fit.
     - `held_out`: comparisons of the starting and the chosen model with recordings that no fit has
       seen.
     - `worth`: what is worth knowing, in % of a joint's torque.
@@ -76,16 +80,31 @@ def refuted(
         return misfit_of(chosen)
     if chosen.status is not Status.converged:
         return f"the fit of the model did not converge ({chosen.status.value})"
-    reason = _above_floor(chosen, floor, worth)
+    reason = _explains_little(chosen, noise) or _above_floor(chosen, diagnosis, worth)
     if held_out is None or reason:
         return reason
     before, after = held_out
     return _risen(before, after, noise) or _above_noise(chosen, after, noise, worth)
 
 
-def _above_floor(fit: Fit, floor: Float[np.ndarray, "recordings joints"], worth: float) -> str:
+def _explains_little(fit: Fit, noise: Sequence[ARFilter]) -> str:
+    """Whether much of a joint's torque is left that does not look like noise of a sensor."""
     left = over_recordings(fit.error_percent.to_numpy())
-    by_noise = over_recordings(floor)
+    for label, percent, filt in zip(joint_columns(fit.loop.joints), left, noise, strict=True):
+        if percent > _THIRD and filt.gain > _COLOURED:
+            return (
+                f"it leaves {percent:.3g} % of {label}, and not as white noise: check the units of "
+                "each joint, signs, the order of the joints, time stamps and the control law"
+            )
+    return ""
+
+
+def _above_floor(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
+    """Whether many effects together explain what the score finds no few of them for."""
+    if diagnosis.unexplained < DECISIVE:
+        return ""
+    left = over_recordings(fit.error_percent.to_numpy())
+    by_noise = diagnosis.floor_percent()
     ratio = np.where(left**2 - by_noise**2 > worth**2, left / np.maximum(by_noise, 1e-12), 0.0)
     worst = int(np.argmax(ratio))
     if not ratio[worst] > _REFUTED:

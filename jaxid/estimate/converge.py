@@ -188,7 +188,7 @@ def finer_substeps(done: Converged) -> int | None:
         shortest = int(np.argmin([piece.samples for piece in done.pieces]))
         batch = taken(batch, np.array([shortest]))
     runs = [simulate_batch(set_substeps(done.loop, k), batch).tau for k in (now, 2 * now)]
-    coarse, fine = (x if batch.band is None else batch.band(jnp.asarray(x)) for x in runs)
+    coarse, fine = map(batch.compared, runs)
     there = np.asarray(batch.kept)
     coarse, fine = np.asarray(coarse)[there], np.asarray(fine)[there]
     size = np.linalg.norm(fine, axis=0)

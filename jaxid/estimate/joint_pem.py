@@ -163,7 +163,11 @@ def _converge_jointly(
 def _check_samples(problem: Problem, orders: Sequence[int]) -> None:
     """Refuses orders that the recordings do not allow, before any work."""
     kept = np.asarray(problem.batch.kept)
-    signals = [np.asarray(getattr(problem.batch, s)) for s in problem.signals]
+    batch = problem.batch
+    signals = [
+        np.asarray(batch.compared(getattr(batch, s) * batch.mask[..., None]))
+        for s in problem.signals
+    ]
     for output, order in enumerate(orders):
         signal, joint = divmod(output, problem.loop.joints)
         series = [x[there, joint] for x, there in zip(signals[signal], kept, strict=True)]

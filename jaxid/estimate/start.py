@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -79,8 +78,7 @@ def _simulated_error(loop: ClosedLoop, recordings: Recordings, batch: Batch) -> 
         return np.inf
     there = np.asarray(batch.mask)[..., None]
     measured, left = (np.where(there, x, 0.0) for x in (batch.tau, batch.tau - tau))
-    if batch.band is not None:
-        measured, left = batch.band(jnp.asarray(measured)), batch.band(jnp.asarray(left))
+    measured, left = batch.compared(measured), batch.compared(left)
     error, size = (np.sum(np.asarray(x) ** 2, axis=(0, 1)) for x in (left, measured))
     total = float(np.mean(error / size))
     return total if np.isfinite(total) else np.inf

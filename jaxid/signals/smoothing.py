@@ -6,12 +6,14 @@ import itertools
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..errors import RecordingError
 from ..recording import Recording
 
 ORDER = 4
+# Samples in a period of the cutoff: half of them reach to where the filter has a sixth left.
+_SAMPLES = 2.5
 
 
 def low_pass(
@@ -108,12 +110,16 @@ def signal_cutoff(recording: Recording) -> float:
 class Band(eqx.Module):
     """The part of signals that is compared: frequencies, by a zero-phase filter, and samples.
 
-    `gain` is the filter's at the frequencies of a real Fourier transform, `keep` says which
-    samples are far enough from the ends.
+    Samples are as far apart as the low-pass allows: a likelihood of samples that follow each other
+    faster would be one of rounding, for above the cutoff there is next to nothing.
+
+    - `gain`: the filter's at the frequencies of a real Fourier transform.
+    - `rows`: the samples that are left, far enough from the ends; `keep` says which are there.
     """
 
     gain: Float[Array, "recordings frequencies"]
-    keep: Bool[Array, "recordings samples"]
+    rows: Int[Array, "recordings rows"]
+    keep: Bool[Array, "recordings rows"]
 
     @classmethod
     def of(cls, recordings: list[Recording], cutoffs: list[float], samples: int) -> "Band":
@@ -121,34 +127,44 @@ class Band(eqx.Module):
 
         **Arguments:**
 
-        - `cutoffs`: of each recording's low-pass, Hz.
+        - `cutoffs`: up to which each recording's motion is known, Hz; the lowest is that of all.
 
         **Raises:** `RecordingError` where a recording is over before the filter has settled.
         """
         import scipy
 
-        rows, kept = [], np.zeros((len(recordings), samples), bool)
-        memory = max(r.rate / c for r, c in zip(recordings, cutoffs, strict=True))
+        cutoff, gains, rows = min(cutoffs), [], []
+        memory = max(r.rate for r in recordings) / cutoff
         size = 1 << int(np.ceil(np.log2(samples + 4 * memory)))
-        for k, (r, cutoff) in enumerate(zip(recordings, cutoffs, strict=True)):
+        for r in recordings:
             sections = scipy.signal.butter(ORDER, cutoff, fs=r.rate, output="sos")
             grid = np.fft.rfftfreq(size, 1 / r.rate)
-            rows.append(np.abs(scipy.signal.sosfreqz(sections, grid, fs=r.rate)[1]) ** 2)
+            gains.append(np.abs(scipy.signal.sosfreqz(sections, grid, fs=r.rate)[1]) ** 2)
             trim = int(np.ceil(2 * r.rate / cutoff))
-            kept[k, trim : r.samples - trim] = True
-            if r.samples - 2 * trim < 10:
+            step = max(1, int(r.rate / (_SAMPLES * cutoff)))
+            rows.append(np.arange(trim, r.samples - trim, step))
+            if len(rows[-1]) < 10:
                 raise RecordingError(
                     f"{r.name} lasts {r.duration:.3g} s, and {2 / cutoff:.3g} s at each end are "
                     f"lost to its low-pass at {cutoff:.3g} Hz: give longer recordings or windows"
                 )
-        return cls(jnp.asarray(np.stack(rows)), jnp.asarray(kept))
+        most = max(len(row) for row in rows)
+        keep = np.arange(most) < np.array([[len(row)] for row in rows])
+        filled = np.stack([np.pad(row, (0, most - len(row)), "edge") for row in rows])
+        return cls(jnp.asarray(np.stack(gains)), jnp.asarray(filled), jnp.asarray(keep))
 
     def __call__(
         self, x: Float[Array, "recordings samples *axes"]
-    ) -> Float[Array, "recordings samples *axes"]:
-        """Signals, zero where there is no sample, through the filter; zero at the ends."""
+    ) -> Float[Array, "recordings rows *axes"]:
+        """Signals, zero where there is no sample, through the filter; zero where no row is."""
         axes = (1,) * (x.ndim - 2)
         size = 2 * (self.gain.shape[1] - 1)
         wave = jnp.fft.rfft(x, size, axis=1) * self.gain.reshape(*self.gain.shape, *axes)
-        passed = jnp.fft.irfft(wave, size, axis=1)[:, : x.shape[1]]
+        passed = self.picked(jnp.fft.irfft(wave, size, axis=1))
         return passed * self.keep.reshape(*self.keep.shape, *axes)
+
+    def picked(
+        self, x: Float[Array, "recordings samples *axes"]
+    ) -> Float[Array, "recordings rows *axes"]:
+        """The rows that are left of signals."""
+        return x[jnp.arange(len(self.rows))[:, None], self.rows]

@@ -1,6 +1,7 @@
 """Recordings as a batch of intervals that drive a loop: made on the host, with NumPy."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -56,9 +57,15 @@ class Batch(eqx.Module):
     band: Band | None = None
 
     @property
-    def kept(self) -> Bool[Array, "recordings samples"]:
-        """Which samples are there and compared."""
+    def kept(self) -> Bool[Array, "recordings rows"]:
+        """Which of the compared rows are there."""
         return self.mask if self.band is None else self.band.keep
+
+    def compared(
+        self, x: Float[Any, "recordings samples *axes"]
+    ) -> Float[Any, "recordings rows *axes"]:
+        """What of signals at the samples, zero where there is none, is compared."""
+        return x if self.band is None else self.band(jnp.asarray(x))
 
 
 def _pieces(
@@ -279,7 +286,7 @@ def compared(
     band = band_of(loop, recordings)
     if band is None:
         return list(signals)
-    longest = band.keep.shape[1]
+    longest = max(len(x) for x in signals)
     padded = np.stack([np.pad(x, ((0, longest - len(x)), (0, 0))) for x in signals])
     passed, keep = np.asarray(band(jnp.asarray(padded))), np.asarray(band.keep)
     return [x[kept] for x, kept in zip(passed, keep, strict=True)]

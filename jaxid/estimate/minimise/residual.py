@@ -124,8 +124,7 @@ def sensitivity_from(
     scale = weights * batch.mask[..., None]
     residual = (measured - seen) * scale
     slopes = -slopes * scale[..., None]
-    if batch.band is not None:
-        residual, slopes = batch.band(residual), batch.band(slopes)
+    residual, slopes = batch.compared(residual), batch.compared(slopes)
     by_start = slopes[..., p:] if slopes.shape[-1] > p else None
     return Sensitivity(residual, residual, slopes[..., :p], by_start, result), *end
 
@@ -146,8 +145,7 @@ def raw_residual(
 
     seen = each(one, batch.intervals, batch.at, batch.q0, batch.v0)
     measured = jnp.concatenate([getattr(batch, s) for s in signals], axis=-1)
-    residual = (measured - seen) * weights * batch.mask[..., None]
-    return residual if batch.band is None else batch.band(residual)
+    return batch.compared((measured - seen) * weights * batch.mask[..., None])
 
 
 def through_filter(
