@@ -13,5 +13,6 @@ from .certificate import mass_error as mass_error
 from .computed_torque import ComputedTorque as ComputedTorque
 from .open_loop import OpenLoop as OpenLoop
 from .pd import PD as PD
-from .pd import Sampled as Sampled
+from .pid import PID as PID
+from .sampled import Sampled as Sampled
 from .tracking import Tracking as Tracking

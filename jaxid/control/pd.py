@@ -1,4 +1,4 @@
-"""Proportional-derivative laws, continuous and sampled."""
+"""A proportional-derivative law."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -37,42 +37,3 @@ class PD(AbstractController):
         """The law's torque, `(joints,)`, N·m or N."""
         error = reference.q - reading.q
         return self.Kg * (self.Kp * error - self.Kv * reading.v) + reference.tau
-
-
-class Sampled(AbstractController):
-    """Another law, computed every `every` seconds and held in between.
-
-    **Arguments:**
-
-    - `law`: a continuous controller without states of its own.
-    - `every`: period, s.
-    """
-
-    law: AbstractController
-    every: float = eqx.field(static=True)
-
-    @property
-    def period(self) -> float:
-        """Time between two ticks, s."""
-        return self.every
-
-    def initial_state(self, reading: Reading) -> Float[Array, " states"]:
-        """No torque before the first tick, `(joints,)`."""
-        return jnp.zeros_like(reading.q)
-
-    def tick(
-        self, reading: Reading, reference: Reference, state: Float[Array, " states"]
-    ) -> Float[Array, " states"]:
-        """The command to hold, `(joints,)`."""
-        identity = jnp.eye(reading.q.shape[0])
-        return self.law.command(reading, reference, jnp.zeros(0), identity)
-
-    def command(
-        self,
-        reading: Reading,
-        reference: Reference,
-        state: Float[Array, " states"],
-        mass: Float[Array, "joints joints"],
-    ) -> Float[Array, " joints"]:
-        """The held command, `(joints,)`."""
-        return state
