@@ -20,6 +20,7 @@ _set_loop_threshold()
 from . import arms as arms  # noqa: E402
 from . import control as control  # noqa: E402
 from . import effects as effects  # noqa: E402
+from .compiling import keep_programs as keep_programs  # noqa: E402
 from .effects import Curve as Curve  # noqa: E402
 from .effects import catalogue as catalogue  # noqa: E402
 from .estimate import DIDIM as DIDIM  # noqa: E402

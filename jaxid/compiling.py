@@ -3,6 +3,7 @@
 import functools
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -99,3 +100,21 @@ def _user_sets(flag: str) -> bool:
     """Whether `XLA_FLAGS` have the flag, or may have it: they can name a file of flags instead."""
     flags = os.environ.get("XLA_FLAGS", "").strip()
     return flag in flags or (flags != "" and not flags.startswith("-"))
+
+
+def keep_programs(folder: str | Path | None = None) -> None:
+    """Keeps compiled programs between processes: compiling is most of what a user waits for.
+
+    The command `jaxid` does so by itself. A cache that JAX was given already is left as it is.
+
+    **Arguments:**
+
+    - `folder`: for the programs; by default `jaxid` in the user's cache folder.
+    """
+    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
+        return
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    jax.config.update("jax_compilation_cache_dir", str(folder or base / "jaxid"))
+    # The small ones too: a fit has dozens, and each takes longer to compile than to read.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

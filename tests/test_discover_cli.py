@@ -113,7 +113,14 @@ def test_the_error_on_unseen_recordings_falls_to_the_noise() -> None:
 def test_the_json_has_the_fields_of_its_page() -> None:
     found = told().json
     assert found["robot"] == "scara"
-    assert found["verdict"] in ("adequate", "explained", "outside_catalogue")
+    assert found["verdict"] in ("adequate", "explained", "outside_catalogue", "undetermined")
+    assert bool(found["reason"]) == (found["verdict"] == "undetermined")
+    assert found["added"][0]["probability"] > 0.99
+    best = found["models"][0]
+    assert best["effects"] == [{"effect": "stribeck", "joint": 2}]
+    assert best["weight"] > 0.99
+    assert best["status"] == "converged"
+    assert len(best["fit_percent"]) == len(best["validate_percent"]) == 2
     assert {"effect", "joint", "p_value", "predicted_error_percent"} <= set(found["ranking"][0])
     assert len(found["ranking"][0]["predicted_error_percent"]) == 2
     assert {"effect", "joint", "parameters", "indistinguishable"} <= set(found["added"][0])
@@ -141,6 +148,27 @@ def test_an_effect_of_the_users_is_asked_beside_the_known_ones(tmp_path: Path) -
     assert run.exit_code == 0
     assert tuple(asked[:-1]) == jaxid.catalogue
     assert asked[-1].effect_name() == "hose"
+
+
+@pytest.mark.slow
+def test_what_is_asked_and_the_exit_code_follow_the_options() -> None:
+    asked: dict[str, Any] = {}
+
+    def listening(*args: Any, **settings: Any) -> jaxid.Discovery:
+        asked.update(settings)
+        return dataclasses.replace(told().story, verdict="undetermined", reason="of a test")
+
+    options = ["--exclude", "stribeck", "--worth", "2"]
+    with mock.patch.object(jaxid.discovery, "discover", listening):
+        run = CliRunner().invoke(app, ["discover", *HIDDEN[:2], *options], catch_exceptions=False)
+    assert run.exit_code == 3
+    assert "of a test" in run.stdout
+    assert asked["worth"] == 2
+    left = {entry.effect_name() for entry in asked["catalogue"]}
+    assert left == {entry.effect_name() for entry in jaxid.catalogue} - {"stribeck"}
+    run = CliRunner().invoke(app, ["discover", *HIDDEN[:2], "--exclude", "stribec"])
+    assert run.exit_code == 2
+    assert "no effect 'stribec'" in run.stderr
 
 
 @pytest.mark.slow

@@ -1,8 +1,6 @@
 """The command `jaxid`: its help, its subcommands, its entry point."""
 
 import contextlib
-import os
-from pathlib import Path
 
 import typer
 
@@ -21,9 +19,10 @@ Examples:
 
 \b
 Exit codes:
-  0    it is done, whatever the verdict
+  0    it is done, whatever the verdict but one
   1    a fit that did not converge; its result is printed and written all the same
   2    something given cannot be used; the one line on stderr says what to do
+  3    a discovery whose verdict is undetermined; its result is printed and written all the same
   130  interrupted by Ctrl-C
 
 Colours and progress are shown on a terminal only; NO_COLOR turns colours off.
@@ -44,25 +43,14 @@ app.command(cls=Spread)(discover)
 app.command()(demo)
 
 
-def _keep_programs() -> None:
-    """Keeps compiled programs between runs: compiling is most of what a user waits for."""
-    import jax
-
-    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
-        return
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    jax.config.update("jax_compilation_cache_dir", str(Path(base) / "jaxid"))
-    # The small ones too: a fit has dozens, and each takes longer to compile than to read.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
 def main() -> None:
     """Entry point of the `jaxid` command."""
     leave_on_interrupt()
     # Where there is no home or it cannot be written, each run compiles for itself.
     with contextlib.suppress(OSError, RuntimeError):
-        _keep_programs()
+        from ..compiling import keep_programs
+
+        keep_programs()
     try:
         app()
     except SystemExit as ended:

@@ -12,9 +12,9 @@ import typer
 from typer.core import TyperCommand
 
 from ..errors import RecordingError
-from .ending import sentences
+from .ending import UNDETERMINED, sentences
 from .files import check_outputs, read_files, write_json
-from .models import load_effect, load_robot, with_controller
+from .models import load_effect, load_robot, with_controller, without
 from .options import Catalogue, Column, Controller, Files, Json, Quiet, Report, Robot, Unit
 from .showing import LEGEND, error_falls, say, tell
 
@@ -77,6 +77,13 @@ def discover(
         typer.Option(help="Write story and model to this file (story.jaxid), for compare --fit."),
     ] = None,
     catalogue: Catalogue = None,
+    exclude: Annotated[
+        list[str] | None,
+        typer.Option(help="An effect of the catalogue that is not asked for, as stribeck."),
+    ] = None,
+    worth: Annotated[
+        float, typer.Option(help="What is worth knowing: share of a joint's torque, %.")
+    ] = 0.05,
     column: Column = None,
     unit: Unit = None,
     controller: Controller = None,
@@ -84,8 +91,9 @@ def discover(
 ) -> None:
     """Find the physical effect that the model lacks, and add it.
 
-    The exit code is 0 whatever the verdict, 2 where something given cannot be used. Ctrl-C keeps
-    the steps so far in the folder of --resume, or else in jaxid-steps, and says how to go on.
+    The exit code is 0 for a verdict, 3 where it is undetermined, 2 where something given cannot be
+    used. Ctrl-C keeps the steps so far in the folder of --resume, or else in jaxid-steps, and says
+    how to go on.
 
     \b
     Examples:
@@ -110,7 +118,8 @@ def discover(
             loop,
             read_files(files, column, unit),
             validate=read_files(held_out, column, unit) if held_out else None,
-            catalogue=(*known, *own),
+            catalogue=(*without(known, exclude or ()), *own),
+            worth=worth,
             resume=journal.path,
             progress=not quiet,
         )
@@ -120,6 +129,8 @@ def discover(
             story.save(save)
         if report is not None:
             write_report(story, report)
+    if story.verdict == "undetermined":
+        raise typer.Exit(UNDETERMINED)
 
 
 class _Kept:

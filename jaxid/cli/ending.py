@@ -17,6 +17,7 @@ from ..errors import JaxidError, JaxidWarning
 
 # What shells give for a command that Ctrl-C ended.
 INTERRUPTED = 130
+UNDETERMINED = 3
 
 
 @contextlib.contextmanager

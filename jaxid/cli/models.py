@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,16 +66,20 @@ def _module(path: str) -> Any:
     """A user's Python file, imported."""
     if not Path(path).is_file():
         raise ModelError(f"there is no file {path}: give the path of your own Python file")
-    known = sys.modules.get(Path(path).stem)
-    if known is not None and getattr(known, "__file__", None) == path:
+    known, stamp = sys.modules.get(Path(path).stem), Path(path).stat().st_mtime_ns
+    mine = known is not None and getattr(known, "__file__", None) == path
+    # One class for whoever names the file again, unless it was written anew in between.
+    if mine and getattr(known, "_read_at", None) == stamp:
         return known
     spec = importlib.util.spec_from_file_location(Path(path).stem, path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.path.insert(0, str(Path(path).resolve().parent))
+    module._read_at = stamp  # type: ignore[attr-defined]
     # Annotations that are strings are looked up in the module that they were written in.
-    sys.modules.setdefault(spec.name, module)
+    if known is None or mine:
+        sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
     except Exception as error:
@@ -115,3 +120,18 @@ def with_fitted(loop: Any, path: Path, own: frozenset[type] = frozenset()) -> An
             "`jaxid fit --json` or `jaxid discover --save` wrote"
         ) from error
     return loop.with_values(**found)
+
+
+def without(catalogue: Sequence[Any], names: Sequence[str]) -> list[Any]:
+    """The catalogue less some effects by name.
+
+    **Raises:** `ModelError` for a name that it does not have.
+    """
+    known = {entry.effect_name() for entry in catalogue}
+    unknown = sorted(set(names) - known)
+    if unknown:
+        raise ModelError(
+            f"the catalogue has no effect {unknown[0]!r} to leave out: it has "
+            f"{', '.join(sorted(known))}"
+        )
+    return [entry for entry in catalogue if entry.effect_name() not in names]

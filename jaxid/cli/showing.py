@@ -21,7 +21,7 @@ def pooled(result: Any) -> dict[str, float]:
 def tell(story: Any, quiet: bool = False) -> None:
     """Prints a discovery: its verdict, and all of it where that is wanted."""
     verdict, _, rest = repr(story).partition("\n")
-    colour = "yellow" if story.verdict == "outside_catalogue" else "green"
+    colour = "green" if story.verdict in ("adequate", "explained") else "yellow"
     say(verdict, bold=True, fg=colour)
     if not quiet:
         typer.echo(rest)

@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
 
 
+# Weight from which another model is named beside the best.
+_NAMED = 0.01
+
+
 class Step(eqx.Module):
     """The model with one more of the effects that were found.
 
@@ -288,6 +292,10 @@ class Discovery(AbstractShown):
             if step.alike:
                 others = ", ".join(effect_on(n, j) for n, j in step.alike)
                 lines.append(f"  these recordings cannot tell it from {others}")
+        rivals = [m for m in self.considered if m.weight > _NAMED][1:]
+        if rivals:
+            shown = ", ".join(f"{m.label} ({m.weight:.2g})" for m in rivals)
+            lines.append(f"other models by their weight: {shown}")
         return "\n".join([*lines, *self.notes])
 
     def _repr_html_(self) -> str:

@@ -143,7 +143,7 @@ class Band(eqx.Module):
             trim = int(np.ceil(2 * r.rate / cutoff))
             step = max(1, int(r.rate / (_SAMPLES * cutoff)))
             rows.append(np.arange(trim, r.samples - trim, step))
-            if len(rows[-1]) < 10:
+            if r.samples - 2 * trim < 10:
                 raise RecordingError(
                     f"{r.name} lasts {r.duration:.3g} s, and {2 / cutoff:.3g} s at each end are "
                     f"lost to its low-pass at {cutoff:.3g} Hz: give longer recordings or windows"
