@@ -2,15 +2,18 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy
 from stories import recordings_of
 
 import jaxid
+from jaxid.control import Sampled
 from jaxid.discovery.models import Model
+from jaxid.discovery.remarks import looks_sampled
 from jaxid.discovery.verdict import _power, _spread, _through, refuted, undecided
-from jaxid.effects import Spring, TorqueOffset
+from jaxid.effects import Spring, TimeDelay, TorqueOffset
 from jaxid.noise import ARFilter
 
 pytestmark = pytest.mark.xdist_group("offset")
@@ -99,6 +102,34 @@ def test_a_fit_that_leaves_a_third_says_what_to_check(found):
     # White noise may be as loud.
     white = [ARFilter(np.zeros(0), 1.0)] * 2
     assert "check the units" not in refuted(poor, white, diagnosis, None, WORTH)
+
+
+def test_torque_and_motion_apart_in_time_are_named_with_the_delay(found):
+    fit, diagnosis, late = found.fit, found.diagnosis, 0.02
+    time, torque = np.asarray(diagnosis.motion.t), np.asarray(diagnosis.motion.tau)
+    rate = np.gradient(torque[..., 1], float(time[0, 1] - time[0, 0]), axis=1)
+    residual = diagnosis.data.residual.copy()
+    residual[..., 1] += late * rate * diagnosis.data.mask
+    shifted = dataclasses.replace(
+        diagnosis, data=dataclasses.replace(diagnosis.data, residual=residual)
+    )
+    said = refuted(fit, diagnosis.noise, shifted, None, WORTH)
+    assert "what is left of joint 2" in said
+    delay = float(said.split("Tracking(delay=")[1].split(")")[0])
+    assert delay == pytest.approx(late, rel=0.1)
+
+
+def test_a_drive_that_is_late_by_half_a_samplelooks_sampled(found):
+    fit = found.fit
+    half = fit.recordings.common_period() / 2
+    late = fit.loop.add(TimeDelay(joint=2, delay=jnp.asarray(half)))
+    (said,) = looks_sampled(dataclasses.replace(fit, loop=late))
+    assert f"Sampled(law, every={2 * half:.4g})" in said
+    assert "joint 2" in said
+    later = fit.loop.add(TimeDelay(joint=2, delay=jnp.asarray(8 * half)))
+    assert looks_sampled(dataclasses.replace(fit, loop=later)) == []
+    ticking = dataclasses.replace(late, controller=Sampled(late.controller, every=2 * half))
+    assert looks_sampled(dataclasses.replace(fit, loop=ticking)) == []
 
 
 NOISE = ARFilter(np.array([-1.6, 0.7]), 0.3)

@@ -1,6 +1,7 @@
 """What a controller sees and gives."""
 
 import abc
+from collections.abc import Iterable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -82,6 +83,14 @@ class AbstractController(eqx.Module):
         """How fast a law made up for the simulation is, 1/s, where steps must resolve it."""
         return 0.0
 
+    @property
+    def compensates(self) -> bool:
+        """Whether all that the model's motion takes is added to the command.
+
+        Only a law that is made up for a simulation can do so.
+        """
+        return False
+
     def comparable(self, recording: Recording) -> float | None:
         """Frequency up to which measured and simulated torque may be compared, Hz; None for all.
 
@@ -89,6 +98,10 @@ class AbstractController(eqx.Module):
         and the loop starts on its reference.
         """
         return None
+
+    def settled(self, recordings: Iterable[Recording]) -> "AbstractController":
+        """The same with what it takes from the recordings that it is fitted to, for all others."""
+        return self
 
     def signals(self, recording: Recording) -> Signals:
         """Reference and known torque, taken from a recording.

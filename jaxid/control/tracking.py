@@ -1,6 +1,8 @@
 """A virtual controller for robots whose real one is unknown."""
 
+import dataclasses
 import math
+from collections.abc import Iterable
 
 import equinox as eqx
 import numpy as np
@@ -12,30 +14,41 @@ from ._base import AbstractController, Reading, Reference, Signals
 
 
 class Tracking(AbstractController):
-    """tau = M (a_m + 2 zeta w (v_m - v) + w² (q_m - q)): follows the recorded motion q_m.
+    """tau = M (a_m + 2 zeta w (v_m - v) + w² (q_m - q)) + h: follows the recorded motion q_m.
 
     Only the tracking has to be alike for the simulated torque to be held against the measured one
-    (Gautier, Janot, Vandanjon 2013); M is the model's mass matrix. The recorded motion is
+    (Gautier, Janot, Vandanjon 2013). M is the model's mass matrix and h all else that its motion
+    takes, friction included: the torque is that of inverse dynamics along the recorded motion, and
+    feedback is left with what gives the arm a motion of its own. The recorded motion is
     low-passed, forward and backward, so that noise is not differentiated into torque. The measured
     torque holds what that motion cannot explain, so it and the simulated one pass the same filter
     before they are compared (the parallel filter of Gautier 1997).
 
     **Arguments:**
 
-    - `bandwidth`: of the virtual loop, Hz; above `cutoff`, for what it does not follow is lost.
+    - `bandwidth`: of the virtual loop, Hz; above `cutoff`, for what feedback does not follow is
+      lost.
     - `damping`: ratio of the virtual loop.
+    - `delay`: how much later than it was recorded torque acts, s: half a period for the commands of
+      a law that is computed as often as it is recorded, and held in between.
     - `cutoff`: of the low-pass, Hz; by default where the recorded motion's spectrum sinks into
-      noise.
+      noise, and once fitted the lowest of these.
     """
 
     bandwidth: float = 40.0
     damping: float = 1.0
     cutoff: float | None = eqx.field(static=True, default=None)
+    delay: float = eqx.field(static=True, default=0.0)
 
     @property
     def pace(self) -> float:
         """The virtual loop's, 1/s."""
         return 2 * math.pi * self.bandwidth
+
+    @property
+    def compensates(self) -> bool:
+        """It does, so that torque does not lag behind the motion that takes it."""
+        return True
 
     def command(
         self,
@@ -44,7 +57,7 @@ class Tracking(AbstractController):
         state: Float[Array, " states"],
         mass: Float[Array, "joints joints"],
     ) -> Float[Array, " joints"]:
-        """The virtual law's torque, `(joints,)`, N·m or N."""
+        """The virtual law's torque without what the model adds to it, `(joints,)`, N·m or N."""
         w = 2 * math.pi * self.bandwidth
         rate = 2 * self.damping * w * (reference.v - reading.v)
         return mass @ (reference.a + rate + w**2 * (reference.q - reading.q)) + reference.tau
@@ -53,8 +66,15 @@ class Tracking(AbstractController):
         """The low-pass's cutoff, Hz."""
         return self.cutoff or signal_cutoff(recording)
 
+    def settled(self, recordings: Iterable[Recording]) -> "Tracking":
+        """With one cutoff for all: the lowest up to which any of their motions is known."""
+        return dataclasses.replace(self, cutoff=min(map(self.comparable, recordings)))
+
     def signals(self, recording: Recording) -> Signals:
         """The low-passed recorded motion, `(samples, joints)`."""
         smooth = smooth_motion(recording, self.comparable(recording))
-        q = resampled(even_times(recording), smooth, recording.time)
+        times = even_times(recording)
+        # The motion that a torque takes is that of when it acts; at the end nothing is known of it.
+        at = np.clip(recording.time + self.delay, times[0], times[-1])
+        q = resampled(times, smooth, at)
         return Signals(q, np.zeros_like(recording.tau))

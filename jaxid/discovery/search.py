@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 
 from ..control import OpenLoop
@@ -20,6 +19,7 @@ from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
+from .asked import Asked
 from .comparison import compare
 from .diagnosis import Diagnosis, over_recordings, share_left
 from .explore import DECISIVE, Candidate, explore, key_of
@@ -28,10 +28,11 @@ from .landscape import Landscape, form, forms_of
 from .likelihood import price, score_of
 from .models import Model, Named, Visited, named, probability, worth_keeping
 from .ranking import Screened, judge
+from .remarks import remarks
 from .screening import screen
 from .story import Discovery, Step
 from .verdict import Outcome, misfit_of, refuted, undecided
-from .verify import Refits, is_there, needed, quiet
+from .verify import Refits, is_there, needed
 
 # Sets that are refitted in one round, and the share of what the best gains by which predictions
 # are off.
@@ -99,35 +100,6 @@ def discover(
         search = Search(asked, campaign, say)
         verdict, unfinished = search.run(loop)
         return search.story(verdict, unfinished, started)
-
-
-class Asked(eqx.Module):
-    """What a discovery was asked."""
-
-    recordings: Recordings
-    held_out: Recordings | None
-    method: OEM
-    catalogue: tuple[Any, ...]
-    significance: float
-    worth: float
-    most: int
-
-    def plan(self) -> dict[str, Any]:
-        """What the fits follow from, beside the starting model."""
-        return {
-            "recordings": self.recordings,
-            "validate": self.held_out,
-            "catalogue": [_entry(entry) for entry in self.catalogue],
-            "method": quiet(self.method),
-            "significance": self.significance,
-            "worth": self.worth,
-            "most": self.most,
-        }
-
-    def classes(self) -> set[type]:
-        """The classes of effects that the catalogue names; what its functions make is not known."""
-        given = {entry for entry in self.catalogue if isinstance(entry, type)}
-        return given.union(*(classes_of(entry) for entry in self.catalogue))
 
 
 class Search:
@@ -320,7 +292,7 @@ class Search:
         steps = self._steps(models)
         models = self._held_out(models, steps)
         reason = "" if unfinished else self._doubt(verdict, steps, models)
-        notes = _notes(steps)
+        notes = remarks(steps)
         if unfinished:
             notes = (f"stopped after {self.asked.most} effects, as told: raise most", *notes)
         return Discovery(
@@ -413,16 +385,3 @@ def _piece(effects: Sequence[AbstractEffect]) -> str:
         name, joint, kind = form(e)
         parts.append(f"{name} {joint or ''} {kind}")
     return f"with {', '.join(parts)}"
-
-
-def _notes(steps: Sequence[Step]) -> tuple[str, ...]:
-    bad = [s.label for s in steps if not s.fit.succeeded]
-    if not bad:
-        return ()
-    return (f"the fit of {', '.join(bad)} did not converge: read its values with care",)
-
-
-def _entry(entry: Any) -> Any:
-    """An entry of a catalogue as a plan names it: classes and functions by their names."""
-    name = getattr(entry, "__qualname__", None)
-    return entry if name is None else f"{entry.__module__}.{name}"

@@ -13,6 +13,7 @@ from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
 from .explore import DECISIVE
 from .models import LIKELY, Model
+from .score import spanned
 from .system import System
 
 Outcome = Literal["adequate", "explained", "outside_catalogue", "undetermined"]
@@ -80,7 +81,11 @@ def refuted(
         return misfit_of(chosen)
     if chosen.status is not Status.converged:
         return f"the fit of the model did not converge ({chosen.status.value})"
-    reason = _explains_little(chosen, noise) or _above_floor(chosen, diagnosis, worth)
+    reason = (
+        _explains_little(chosen, noise)
+        or _apart_in_time(chosen, diagnosis, worth)
+        or _above_floor(chosen, diagnosis, worth)
+    )
     if held_out is None or reason:
         return reason
     before, after = held_out
@@ -95,6 +100,44 @@ def _explains_little(fit: Fit, noise: Sequence[ARFilter]) -> str:
             return (
                 f"it leaves {percent:.3g} % of {label}, and not as white noise: check the units of "
                 "each joint, signs, the order of the joints, time stamps and the control law"
+            )
+    return ""
+
+
+def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
+    """Whether a part of what is left is there as if torque and motion had clocks of their own.
+
+    To first order that is the torque's rate, which no curve of one coordinate is, and which a noise
+    filter takes for slow noise.
+    """
+    data, motion = diagnosis.data, diagnosis.motion
+    torque, time = np.asarray(motion.tau), np.asarray(motion.t)
+    if torque.shape != data.residual.shape or data.residual.shape[1] < 3:
+        return ""
+    step = float(np.median(np.diff(time[0])))
+    # Without the noise filters, which have taken such a part for noise.
+    basis = spanned(data.base.reshape(-1, data.base.shape[-1]))
+    left = data.residual.reshape(-1)
+    left = left - basis @ (basis.T @ left)
+    percent = over_recordings(fit.error_percent.to_numpy())
+    for j, label in enumerate(joint_columns(fit.loop.joints)):
+        rate = np.zeros_like(data.residual)
+        rate[..., j] = np.gradient(torque[..., j], step, axis=1) * data.mask
+        own = rate.reshape(-1)
+        own = own - basis @ (basis.T @ own)
+        late = float(own @ left) / max(float(own @ own), 1e-300)
+        rows = own.reshape(rate.shape)
+        pairs = enumerate(diagnosis.noise)
+        chance = np.sqrt(sum(_through(f, x[:, o]) for o, f in pairs for x in rows))
+        rest = left.reshape(rate.shape)[..., j]
+        part = abs(late) * np.linalg.norm(rows[..., j]) / np.linalg.norm(rest)
+        large = part**2 > 1 - 1 / _REFUTED**2 and part * percent[j] > worth
+        if large and abs(float(own @ left)) > _SURE * chance:
+            return (
+                f"what is left of {label} is as if its torque were recorded {1e3 * late:.3g} ms "
+                "before it acts: check time stamps, filters on one of the signals and delays of "
+                f"the drive, which jaxid.control.Tracking(delay={late:.3g}) knows of where the law "
+                "is unknown"
             )
     return ""
 

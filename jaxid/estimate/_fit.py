@@ -37,6 +37,7 @@ def fit(
     recordings = Recordings.of(recordings)
     check_joints(loop, recordings[0])
     check_law(loop)
+    loop = dataclasses.replace(loop, controller=loop.controller.settled(recordings))
     for effect in loop.effects:
         check_declared(effect, loop.joints)
     method = OEM() if method is None else method
@@ -49,7 +50,8 @@ def fit(
     if method.rigid:
         _check_rigid(loop, method)
     found = _followed(_doubted(_honest(method.fit(loop, recordings))))
-    return dataclasses.replace(found, notes=(*found.notes, *_gaps(recordings)))
+    notes = (*found.notes, *_band(loop, recordings), *_gaps(recordings))
+    return dataclasses.replace(found, notes=notes)
 
 
 def _check_rigid(loop: ClosedLoop, method: AbstractMethod) -> None:
@@ -61,6 +63,14 @@ def _check_rigid(loop: ClosedLoop, method: AbstractMethod) -> None:
                 f"{type(method).__name__} takes what the sensors report for the motion of drive "
                 f"and link, which {effect.effect_name()} sets apart: use OEM, or leave it out"
             )
+
+
+def _band(loop: ClosedLoop, recordings: Recordings) -> list[str]:
+    """What to say of torque that is compared in a part of its frequencies only."""
+    cutoff = loop.controller.comparable(recordings[0])
+    if cutoff is None:
+        return []
+    return [f"torque is compared below {cutoff:.3g} Hz, up to which the recorded motion is known"]
 
 
 def _gaps(recordings: Recordings) -> list[str]:

@@ -227,6 +227,8 @@ def instant(
     seen = Reading(seen.q + outside.noise.q, seen.v + outside.noise.v)
     mass = loop.arm.mass_matrix(state.q)
     command = loop.controller.command(seen, reference, state.controller, mass)
+    if loop.controller.compensates:
+        command = command + _taken(loop, t, state, command, mass, outside, label)
     tau = loop.controller.acting(command, state.controller)
     motion = Motion(t, state.q, state.v, jnp.zeros_like(state.q), tau, jnp.zeros(0), label)
     # An effect's own states see what arrives at it, so that lags in a row compose.
@@ -245,6 +247,31 @@ def instant(
             rates.append(effect.derivative(at))
     law = loop.controller.derivative(seen, reference, state.controller)
     return Instant(seen, command, motion.tau, a, State(state.v, a, tuple(rates), law))
+
+
+def _taken(
+    loop: ClosedLoop,
+    t: Float[Array, ""],
+    state: State,
+    command: Float[Array, " joints"],
+    mass: Float[Array, "joints joints"],
+    outside: Outside,
+    label: Int[Array, ""],
+) -> Float[Array, " joints"]:
+    """What a motion takes beside the torque on the arm's inertia, less what comes from outside."""
+    a, none = solve_positive(mass, command), jnp.zeros(0)
+    motion = Motion(t, state.q, state.v, a, jnp.zeros_like(a), none, label)
+    bias = loop.arm.bias(state.q, state.v) - outside.push - outside.pull
+    loaded = any(effect.loaded for effect in loop.effects)
+    if loaded:
+        # What depends on the load is given the torque that the motion takes without it.
+        pairs = zip(loop.effects, state.effects, strict=True)
+        kept = [(e, s) for e, s in pairs if not e.loaded]
+        others = loop.with_effects([e for e, _ in kept])
+        drive, link = effect_loads(others, motion, tuple(s for _, s in kept))
+        motion = dataclasses.replace(motion, tau=command + bias + drive + link)
+    drive, link = effect_loads(loop, motion, state.effects, push=outside.push)
+    return bias + drive + link
 
 
 def _accelerations(
