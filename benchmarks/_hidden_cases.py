@@ -1,4 +1,5 @@
-"""Which cases the blind bench has: robots, effects and noise drawn from one seed."""
+"""Which cases the blind bench has: robots, effects and noise drawn import dataclasses
+from one seed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +18,10 @@ TRANSMISSIONS = {"joint_elasticity", "backlash"}
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a case is to be: its place in the bench, its seed, the effects' names, the noise."""
+    """What a case is to be: its place in the bench, its seed, the effects' names, the noise.
+
+    `law` is what the user knows of the controller: "known" or "unknown".
+    """
 
     number: int
     kind: str
@@ -25,6 +29,7 @@ class Wanted:
     effects: tuple[str, ...]
     noise: str
     robot: str = "scara"
+    law: str = "known"
 
     @property
     def label(self) -> str:
@@ -32,7 +37,9 @@ class Wanted:
         return f"{self.number:03d}_{self.kind}_{'+'.join(self.effects) or self.noise}"
 
 
-def draw_wanted(master: int, quick: bool = False, robot: str = "scara") -> list[Wanted]:
+def draw_wanted(
+    master: int, quick: bool = False, robot: str = "scara", law: str = "known"
+) -> list[Wanted]:
     """The cases of one run, shuffled, so that a part of them says something of all.
 
     With "any" robot, each case has one drawn from those on which its effects make sense.
@@ -60,7 +67,13 @@ def draw_wanted(master: int, quick: bool = False, robot: str = "scara") -> list[
     order = rng.permutation(len(plain)).tolist()
     return [
         Wanted(
-            number, plain[k][0], seeds[k], plain[k][1], colours[k], _robot(rng, robots, plain[k][1])
+            number,
+            plain[k][0],
+            seeds[k],
+            plain[k][1],
+            colours[k],
+            _robot(rng, robots, plain[k][1]),
+            law,
         )
         for number, k in enumerate(order)
     ]
@@ -85,8 +98,10 @@ def build(wanted: Wanted) -> sim.Case:
     return sim.make_case(wanted.seed, wanted.effects, wanted.noise, wanted.robot)
 
 
-def start_model(case: sim.Case) -> jaxid.ClosedLoop:
+def start_model(case: sim.Case, law: str = "known") -> jaxid.ClosedLoop:
     """The model that a user would start from: the robot under its controller, without effects."""
+    if law == "unknown":
+        return dataclasses.replace(start_model(case), controller=jaxid.control.Tracking())
     if case.robot == "scara":
         return jaxid.scara()
     if case.robot == "axis":

@@ -1,7 +1,7 @@
 """What was right of a story, case by case and over all of them."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,10 +38,17 @@ def expected_place(effect: Any) -> tuple[str, int]:
     return coordinate, j
 
 
-def judge(case: sim.Case, kind: str, story: dict[str, Any]) -> dict[str, Any]:
-    """What was right of a story."""
+def judge(
+    case: sim.Case, kind: str, story: dict[str, Any], floor: Sequence[float] | None = None
+) -> dict[str, Any]:
+    """What was right of a story.
+
+    **Arguments:**
+
+    - `floor`: what noise leaves of the held-out recording, %, where it is compared in a band.
+    """
     found, true = groups(story), [true_key(e) for e in case.effects]
-    floor = case.recordings["held_out"]["noise_floor_percent"]
+    floor = case.recordings["held_out"]["noise_floor_percent"] if floor is None else floor
     after = np.array(story["error_percent"]["after"]["validate"])
     marks: dict[str, Any] = {"ratio": float((after / floor).max()), "verdict": story["verdict"]}
     if kind == "clean":
@@ -178,6 +185,11 @@ def show_summary(result: dict[str, Any]) -> None:
     print(f"errors: {result['errors'] or 'none'}", flush=True)
 
 
+def _by_noise(chi: dict[str, float]) -> str:
+    fit, held_out, count = (chi[k] for k in ("fit", "held_out", "parameters"))
+    return f", chi squared {fit:.0f}, held out {held_out:.0f}, {count} parameters"
+
+
 def show_failure(record: dict[str, Any]) -> None:
     """Prints what a case was, what was found, and what an oracle finds."""
     print(
@@ -192,8 +204,7 @@ def show_failure(record: dict[str, Any]) -> None:
     print(f"  {record['marks']['verdict']}: {_found(record)}; ratio {record['marks']['ratio']:.4f}")
     for step in record["steps"]:
         chi = step["chi_squared"]
-        fit = f"{chi['fit']:.0f}, held out {chi['held_out']:.0f}, {chi['parameters']} parameters"
-        print(f"  {step['label']}: {step['status']}, chi squared {fit}")
+        print(f"  {step['label']}: {step['status']}{'' if chi is None else _by_noise(chi)}")
         for title, lines in (("", step["ranking"][:4]), ("curve ", step["where"][:2])):
             for v in lines:
                 mark = "" if v["possible"] else " (not possible)"

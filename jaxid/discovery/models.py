@@ -68,6 +68,12 @@ class Model(eqx.Module):
         return "predicted" if self.fit is None else self.fit.status.name
 
     @property
+    def unseen_percent(self) -> Float[np.ndarray, " joints"] | None:
+        """Relative error on recordings that no fit has seen, by joint, %."""
+        held = self.held_out
+        return None if held is None else over_recordings(held.error_percent.to_numpy())
+
+    @property
     def label(self) -> str:
         """What it has over the starting model, in words."""
         parts = [effect_on(*named(e)) for e in self.effects]
@@ -185,8 +191,7 @@ def compared(models: Sequence[Model]) -> "pd.DataFrame":
             "weight": m.weight,
         }
         row |= _by_joint("fit", m.left)
-        if m.held_out is not None:
-            row |= _by_joint("held out", over_recordings(m.held_out.error_percent.to_numpy()))
+        row |= _by_joint("held out", m.unseen_percent)
         rows.append({**row, "status": m.status})
     table = pd.DataFrame(rows)
     last = table.pop("status")

@@ -329,7 +329,7 @@ def _odds(share: float) -> str:
 
 def _told(model: Model, best: float) -> dict[str, Any]:
     """A model as plain JSON."""
-    held = model.held_out
+    unseen = model.unseen_percent
     return {
         "model": model.label,
         "effects": [{"effect": n, "joint": j} for n, j in model.names],
@@ -338,7 +338,7 @@ def _told(model: Model, best: float) -> dict[str, Any]:
         "difference": model.score - best,
         "weight": model.weight,
         "fit_percent": None if model.left is None else model.left.tolist(),
-        "validate_percent": None if held is None else _rms(held.error_percent).tolist(),
+        "validate_percent": None if unseen is None else unseen.tolist(),
         "status": model.status,
     }
 

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from ..discovery import Discovery
 from ..discovery.diagnosis import Diagnosis, Verdict
 from ..discovery.models import Model
@@ -25,8 +27,37 @@ def choice(story: Discovery) -> Markup:
     for name, joint in story.removed:
         where = "" if joint is None else f" on joint {joint}"
         pieces.append(tag("p", f"{name}{where} was added and later found not to be needed."))
+    if story.considered:
+        pieces.append(_models(story))
     title = "Why this effect and not its rivals" if len(story.steps) > 1 else "What was asked"
     return section(title, *pieces)
+
+
+def _models(story: Discovery) -> Content:
+    """The best of all models that were looked at, beside each other."""
+
+    def percent(errors: np.ndarray | None) -> str:
+        return "" if errors is None else ", ".join(f"{x:.2f}" for x in errors)
+
+    best = story.considered[0].score
+    rows = [
+        [
+            m.label,
+            f"{m.score - best:.1f}",
+            probability(m.weight),
+            percent(m.left),
+            percent(m.unseen_percent),
+            m.status,
+        ]
+        for m in story.considered[:12]
+    ]
+    said = (
+        "The weight of a model with score S is exp(-S/2), over the sum of that of all models. "
+        "Recordings that were held out enter the last errors only."
+    )
+    columns = ["model", "behind the best", "weight", "fitted error, %", "held-out error, %", "fit"]
+    shown = table(columns, rows, "the best models")
+    return details("The models that were looked at", tag("p", said), shown)
 
 
 def _reason(diagnosis: Diagnosis, step: Step) -> str:
