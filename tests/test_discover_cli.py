@@ -136,10 +136,12 @@ def test_the_json_has_the_fields_of_its_page() -> None:
 @pytest.mark.slow
 def test_an_effect_of_the_users_is_asked_beside_the_known_ones(tmp_path: Path) -> None:
     asked: list[Any] = []
+    # Before the command is patched, which tells the story.
+    story = told().story
 
     def listening(*args: Any, catalogue: Any, **settings: Any) -> jaxid.Discovery:
         asked.extend(catalogue)
-        return told().story
+        return story
 
     (tmp_path / "own.py").write_text(HOSE, encoding="utf-8")
     own = ["--catalogue", str(tmp_path / "own.py") + ":Hose"]
@@ -153,10 +155,11 @@ def test_an_effect_of_the_users_is_asked_beside_the_known_ones(tmp_path: Path) -
 @pytest.mark.slow
 def test_what_is_asked_and_the_exit_code_follow_the_options() -> None:
     asked: dict[str, Any] = {}
+    story = dataclasses.replace(told().story, verdict="undetermined", reason="of a test")
 
     def listening(*args: Any, **settings: Any) -> jaxid.Discovery:
         asked.update(settings)
-        return dataclasses.replace(told().story, verdict="undetermined", reason="of a test")
+        return story
 
     options = ["--exclude", "stribeck", "--worth", "2"]
     with mock.patch.object(jaxid.discovery, "discover", listening):
