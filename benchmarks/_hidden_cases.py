@@ -1,6 +1,6 @@
-"""Which cases the blind bench has: robots, effects and noise drawn import dataclasses
-from one seed."""
+"""Which cases the blind bench has: robots, effects and noise drawn from one seed."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
