@@ -17,7 +17,7 @@ from jaxid.effects import Curve, Motion, TorqueOffset
 @pytest.mark.xdist_group("offset")
 def test_predicted_error_is_the_one_that_adding_leaves(offset_story):
     story, _ = offset_story
-    start = story.before
+    start = story.first_diagnosis
     predicted = start.predicted_error(start.ranking[0])
     np.testing.assert_allclose(predicted, story.to_dict()["error_percent"]["after"]["fit"], 0.02)
     assert story.table().iloc[0, 1] > 1.1 * predicted[1]
@@ -44,7 +44,7 @@ def test_own_effect_is_screened_like_the_rest(bump_story):
 
 @pytest.mark.xdist_group("bump")
 def test_results_show_themselves(bump_story):
-    diagnosis = bump_story.before
+    diagnosis = bump_story.first_diagnosis
     assert {"effect", "joint", "p_value", "amplitude"} <= set(diagnosis.table().columns)
     assert diagnosis.where_table().iloc[0]["coordinate"] == "q2"
     # A story keeps the signatures of its rankings alone; those of all curves are far more.
@@ -126,7 +126,7 @@ def test_effect_given_as_an_object_is_screened(offset_story):
 @pytest.mark.xdist_group("offset")
 def test_next_experiment_keeps_its_limits_and_separates(offset_story):
     story, _ = offset_story
-    diagnosis = story.before
+    diagnosis = story.first_diagnosis
     pair = [v for v in diagnosis.ranking if v.key in (("torque_offset", 2), ("spring", 2))]
     proposed = jaxid.next_experiment(diagnosis, pair, tries=6, duration=6.0)
     limits = jaxid.Limits.of(diagnosis.fit.recordings)
@@ -143,7 +143,7 @@ def test_next_experiment_keeps_its_limits_and_separates(offset_story):
 @pytest.mark.xdist_group("offset")
 def test_an_experiment_for_a_transmission_is_refused(offset_story):
     story, _ = offset_story
-    diagnosis = story.before
+    diagnosis = story.first_diagnosis
     shaft = next(v for v in diagnosis.ranking if v.key == ("joint_elasticity", 1))
     with pytest.raises(jaxid.errors.FitError, match="joint_elasticity on joint 1 is a simulation"):
         jaxid.next_experiment(diagnosis, [diagnosis.ranking[0], shaft])

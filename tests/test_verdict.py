@@ -13,7 +13,8 @@ from jaxid.control import Sampled
 from jaxid.discovery.models import Model
 from jaxid.discovery.remarks import looks_sampled
 from jaxid.discovery.verdict import _power, _spread, _through, refuted, undecided
-from jaxid.effects import Spring, TimeDelay, TorqueOffset
+from jaxid.discovery.verify import Refits
+from jaxid.effects import Spring, TimeDelay, TorqueOffset, TorqueRipple
 from jaxid.noise import ARFilter
 
 pytestmark = pytest.mark.xdist_group("offset")
@@ -183,3 +184,16 @@ def test_another_model_of_the_table_can_be_chosen(found):
         found.choose(999)
     with pytest.raises(jaxid.errors.ModelError, match="no model 'no such'"):
         found.choose("no such")
+
+
+def test_an_effect_that_is_there_twice_is_chosen_twice(found, monkeypatch):
+    one, other = TorqueRipple(joint=1, harmonic=2.0), TorqueRipple(joint=1, harmonic=3.0)
+    fit = found.fit
+    both = Model((one, other), 1.0, beyond=1)
+    table = (Model((one,), 0.0, fit=fit), both, Model((), 9.0, fit=fit))
+    asked = []
+    monkeypatch.setattr(
+        Refits, "with_effects", lambda self, before, effects, noise: asked.extend(effects) or before
+    )
+    dataclasses.replace(found, considered=table).choose(1)
+    assert asked == [other]

@@ -3,7 +3,6 @@
 import dataclasses
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -14,6 +13,7 @@ from ..noise import ARFilter
 from .landscape import Entry, Landscape, form, shares_a_joint
 from .likelihood import score
 from .predict import Prediction, least_squares
+from .score import spanned
 
 # Difference of scores that decides: odds of 150 to 1.
 DECISIVE = 10.0
@@ -136,21 +136,28 @@ def _refined(landscape: Landscape, c: Candidate) -> Candidate:
     Sets are looked for through one noise for all. A full fit has its own, and with it a likelihood
     that is larger the more is left to explain.
     """
-    data = landscape.predictor.data
-    wide = [data.base, c.prediction.moved, *([] if c.columns is None else [c.columns])]
-    columns = np.concatenate(wide, axis=-1).astype(float)
-    moved = c.taken
     for _ in range(_TURNS if np.isfinite(c.score) else 0):
-        white = data.white(columns, c.noise).reshape(-1, columns.shape[-1])
-        left = data.white(c.rest, c.noise).reshape(-1)
-        low, high = landscape.predictor.limits
-        taken = least_squares(left, white, (low - moved, high - moved))[0]
-        rest = (c.rest - columns @ taken) * data.mask[..., None]
-        better = _scored(landscape, c, rest)
+        better = _estimated(landscape, c, c.noise)
         if better.score > c.score - 1:
             break
-        c, moved = better, moved + taken[: len(moved)]
+        c = better
     return c
+
+
+def _estimated(landscape: Landscape, c: Candidate, noise: Sequence[ARFilter]) -> Candidate:
+    """A set with all that is linear in it estimated from where it is, through noise filters."""
+    data = landscape.predictor.data
+    wide = [data.base, c.prediction.moved, *([] if c.columns is None else [c.columns])]
+    columns = np.concatenate(wide, axis=-1)
+    white = data.white(columns, noise).reshape(-1, columns.shape[-1])
+    left = data.white(c.rest, noise).reshape(-1)
+    basis = spanned(white)
+    low, high = landscape.predictor.limits
+    within = low - c.taken, high - c.taken
+    more = least_squares(basis.T @ left, basis.T @ white, within)[0]
+    rest = (c.rest - columns @ more) * data.mask[..., None]
+    moved = dataclasses.replace(c, taken=c.taken + more[: len(c.taken)])
+    return _scored(landscape, moved, rest)
 
 
 def _moves(
@@ -206,17 +213,12 @@ def _with_curves(landscape: Landscape, at: Candidate) -> list[Candidate]:
 
 
 def _curved(landscape: Landscape, at: Candidate, entry: Entry) -> Candidate:
-    data, noise = landscape.predictor.data, landscape.predictor.noise
-    columns = landscape.data.columns(entry.hypothesis.columns).astype(float)
-    wide = np.concatenate([data.base, at.prediction.moved, columns], axis=-1)
-    white: Any = data.white(wide, noise).reshape(-1, wide.shape[-1])
-    left = data.white(at.prediction.rest, noise).reshape(-1)
-    low, high = landscape.predictor.limits
-    moved = at.prediction.taken
-    taken = least_squares(left, white, (low - moved, high - moved))[0]
-    rest = (at.prediction.rest - wide @ taken) * data.mask[..., None]
     assert isinstance(entry.effect, Curve)
     made = dataclasses.replace(
-        at, curve=entry.effect, columns=columns, taken=moved + taken[: len(moved)]
+        at,
+        rest=at.prediction.rest,
+        taken=at.prediction.taken,
+        curve=entry.effect,
+        columns=landscape.data.columns(entry.hypothesis.columns).astype(float),
     )
-    return _scored(landscape, made, rest)
+    return _estimated(landscape, made, landscape.predictor.noise)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, Curve
+from ..errors import ModelError
 from ..estimate import Fit
 from ..estimate.result import joint_columns
 from ..noise import ARFilter
@@ -81,6 +82,26 @@ class Model(eqx.Module):
             along = f"{self.curve.label}{' and direction' if self.curve.signed else ''}"
             parts.append(f"curve of {along} on joint {self.curve.joint}")
         return " + ".join(parts) or "start"
+
+    def to_dict(self, best: float) -> dict[str, Any]:
+        """The model as plain JSON.
+
+        **Arguments:**
+
+        - `best`: the score of the best model.
+        """
+        unseen = self.unseen_percent
+        return {
+            "model": self.label,
+            "effects": [{"effect": n, "joint": j} for n, j in self.names],
+            "curve": None if self.curve is None else self.curve.effect_name(),
+            "score": self.score,
+            "difference": self.score - best,
+            "weight": self.weight,
+            "fit_percent": None if self.left is None else self.left.tolist(),
+            "validate_percent": None if unseen is None else unseen.tolist(),
+            "status": self.status,
+        }
 
 
 def named(effect: AbstractEffect) -> Named:
@@ -178,7 +199,23 @@ def worth_keeping(models: Sequence[Model]) -> tuple[Model, ...]:
     return tuple(m for k, m in enumerate(models) if k < _KEPT or m.fit is not None)
 
 
-def compared(models: Sequence[Model]) -> "pd.DataFrame":
+def picked(models: Sequence[Model], asked: int | str) -> Model:
+    """A model by its row in the table, or by its name there.
+
+    **Raises:** `ModelError` where there is none.
+    """
+    found = models if isinstance(asked, int) else [m for m in models if m.label == asked]
+    place = asked if isinstance(asked, int) else 0
+    if not 0 <= place < len(found):
+        what = f"row {asked}" if isinstance(asked, int) else f"model {asked!r}"
+        raise ModelError(
+            f"there is no {what} among the {len(models)} models of this discovery: "
+            "see the table Discovery.models"
+        )
+    return found[place]
+
+
+def models_table(models: Sequence[Model]) -> "pd.DataFrame":
     """Models beside each other: score, difference to the best, weight, errors in %, status."""
     import pandas as pd
 

@@ -12,7 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..effects import AbstractEffect
 from ..estimate.minimise import Filling, Stopping, Sums, descend
@@ -57,15 +57,16 @@ class Prediction(eqx.Module):
 class Predictor(eqx.Module):
     """A linear system as it is seen through noise filters, with the base projected out.
 
-    `limits` are how far the base's values may move from where they were fitted.
+    - `basis`: of the span of the whitened base, and `base` what the base is in it.
+    - `limits`: how far the base's values may move from where they were fitted.
     """
 
     system: System
     data: Data
     noise: tuple[ARFilter, ...]
-    base: Float[np.ndarray, "rows absorbed"]
+    basis: Float[np.ndarray, "rows rank"]
+    base: Float[np.ndarray, "rank absorbed"]
     limits: tuple[Float[np.ndarray, " absorbed"], Float[np.ndarray, " absorbed"]]
-    rank: int
 
     @classmethod
     def of(cls, system: System, noise: Sequence[ARFilter], level: Any = None) -> "Predictor":
@@ -83,8 +84,8 @@ class Predictor(eqx.Module):
         free = np.full(base.shape[1] - len(theta), np.inf)
         lower = np.append(np.minimum(np.asarray(bounds.lower) - theta, 0.0), -free)
         upper = np.append(np.maximum(np.asarray(bounds.upper) - theta, 0.0), free)
-        rank = spanned(base).shape[1]
-        return cls(system, data, tuple(noise), base, (lower, upper), rank)
+        basis = spanned(base)
+        return cls(system, data, tuple(noise), basis, basis.T @ base, (lower, upper))
 
     def predict(self, effects: Sequence[AbstractEffect], steps: int = 20) -> Prediction:
         """The effects, from where they are, refined together.
@@ -122,10 +123,15 @@ class Predictor(eqx.Module):
         there = bool(np.isfinite(both).all())
         both = both if there else np.zeros_like(both)
         white = self.data.white(both, self.noise).reshape(-1, both.shape[-1])
-        taken, free = least_squares(white[:, 0], self.base, self.limits)
-        white[:, 0] -= self.base @ taken
-        basis = spanned(free)
-        white[:, 1:] -= basis @ (basis.T @ white[:, 1:])
+        # In the span of the base: what is outside of it no value of the base can move.
+        within = self.basis.T @ white
+        taken, free = least_squares(within[:, 0], self.base, self.limits)
+        absorbed = within.copy()
+        absorbed[:, 0] = self.base @ taken
+        if not free.all():
+            open_ = spanned(self.base[:, free])
+            absorbed[:, 1:] = open_ @ (open_.T @ within[:, 1:])
+        white = white - self.basis @ absorbed
         gram = white.T @ white
         loss = gram[0, 0] if there else np.inf
         sums = Sums(
@@ -195,7 +201,7 @@ class Predictor(eqx.Module):
             slopes=-found.white[:, 1:],
             taken=found.taken,
             loss=float(found.loss),
-            freedom=self.rank + len(values),
+            freedom=self.basis.shape[1] + len(values),
             possible=bool(there) and not bool(np.any(held & amplitude)),
         )
 
@@ -204,11 +210,12 @@ def least_squares(
     left: Float[np.ndarray, " rows"],
     columns: Float[np.ndarray, "rows columns"],
     limits: tuple[Float[np.ndarray, " bounded"], Float[np.ndarray, " bounded"]],
-) -> tuple[Float[np.ndarray, " columns"], Float[np.ndarray, "rows free"]]:
-    """Coefficients of a bounded least-squares problem, and the columns that are on no bound.
+) -> tuple[Float[np.ndarray, " columns"], Bool[np.ndarray, " columns"]]:
+    """Coefficients of a bounded least-squares problem, and which of them are on no bound.
 
     **Arguments:**
 
+    - `left`, `columns`: few rows, of a decomposition of many.
     - `limits`: of the first columns; the others have none.
     """
     size = np.linalg.norm(columns, axis=0)
@@ -219,14 +226,13 @@ def least_squares(
     taken = np.linalg.lstsq(scaled, left, rcond=1e-9)[0]
     low, high = lower * size, upper * size
     if np.all((taken >= low) & (taken <= high)):
-        return taken / size, columns
+        return taken / size, np.ones(len(size), bool)
     import scipy
 
-    q, r = np.linalg.qr(scaled)
     # An open interval, also for a value that may not move at all.
     room = 1e-9 * (1 + np.abs(taken).max())
-    found = scipy.optimize.lsq_linear(r, q.T @ left, (low - room, high + room), method="bvls")
-    return np.clip(found.x, low, high) / size, columns[:, found.active_mask == 0]
+    found = scipy.optimize.lsq_linear(scaled, left, (low - room, high + room), method="bvls")
+    return np.clip(found.x, low, high) / size, found.active_mask == 0
 
 
 class _Reached(eqx.Module):

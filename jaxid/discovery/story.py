@@ -22,7 +22,7 @@ from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
 from .hypotheses import effect_on, on_recordings
 from .landscape import form
-from .models import Model, compared, named
+from .models import Model, models_table, named, picked
 from .verdict import Outcome
 from .verify import Refits
 
@@ -90,7 +90,7 @@ class Discovery(AbstractShown):
         return found
 
     @property
-    def before(self) -> Diagnosis:
+    def first_diagnosis(self) -> Diagnosis:
         """The diagnosis of the starting model."""
         found = self.steps[0].diagnosis
         assert found is not None
@@ -157,7 +157,7 @@ class Discovery(AbstractShown):
         recordings are of models that were fitted in full and are a step of the story or have a
         weight of a hundredth.
         """
-        return compared(self.considered)
+        return models_table(self.considered)
 
     def contenders(self, step: int) -> tuple[Model, ...]:
         """The models with one effect in another's place that were fitted in full, best first.
@@ -186,19 +186,23 @@ class Discovery(AbstractShown):
 
         **Raises:** `ModelError` where there is no such model.
         """
-        chosen = _chosen(self.considered, model)
+        chosen = picked(self.considered, model)
         if chosen.fit is not None:
             return chosen.fit
-        there = {form(e) for e in chosen.effects}
+        # An effect may be there twice.
+        there = Counter(map(form, chosen.effects))
         parts = [
             m
             for m in self.considered
-            if m.fit is not None and m.curve is None and {form(e) for e in m.effects} <= there
+            if m.fit is not None and m.curve is None and Counter(map(form, m.effects)) <= there
         ]
         before = max(parts, key=lambda m: len(m.effects))
         assert before.fit is not None
-        had = {form(e) for e in before.effects}
-        more = [e for e in chosen.effects if form(e) not in had]
+        had, more = Counter(map(form, before.effects)), []
+        for effect in chosen.effects:
+            had[form(effect)] -= 1
+            if had[form(effect)] < 0:
+                more.append(effect)
         if chosen.curve is not None:
             more.append(chosen.curve)
         refits = Refits(before.fit.recordings, oem_of(before.fit))
@@ -251,7 +255,7 @@ class Discovery(AbstractShown):
             "verdict": self.verdict,
             "reason": self.reason,
             "unfinished": self.unfinished,
-            "ranking": self.before.to_dict()["ranking"],
+            "ranking": self.first_diagnosis.to_dict()["ranking"],
             "added": [
                 {
                     "effect": step.added.effect_name(),
@@ -269,7 +273,7 @@ class Discovery(AbstractShown):
             "noise_floor_percent": self.noise_floor_percent().tolist(),
             "sentence": self.sentence,
             "removed": [{"effect": n, "joint": j} for n, j in self.removed],
-            "models": [_told(m, self.considered[0].score) for m in self.considered],
+            "models": [m.to_dict(self.considered[0].score) for m in self.considered],
             "notes": list(self.notes),
             "seconds": self.seconds,
         }
@@ -310,37 +314,9 @@ class Discovery(AbstractShown):
         )
 
 
-def _chosen(models: Sequence[Model], asked: int | str) -> Model:
-    found = models if isinstance(asked, int) else [m for m in models if m.label == asked]
-    place = asked if isinstance(asked, int) else 0
-    if not 0 <= place < len(found):
-        what = f"row {asked}" if isinstance(asked, int) else f"model {asked!r}"
-        raise ModelError(
-            f"there is no {what} among the {len(models)} models of this discovery: "
-            "see the table Discovery.models"
-        )
-    return found[place]
-
-
 def _odds(share: float) -> str:
     """A probability that is no more certain than its digits."""
     return "> 0.999" if share > 0.999 else f"{share:.3g}"
-
-
-def _told(model: Model, best: float) -> dict[str, Any]:
-    """A model as plain JSON."""
-    unseen = model.unseen_percent
-    return {
-        "model": model.label,
-        "effects": [{"effect": n, "joint": j} for n, j in model.names],
-        "curve": None if model.curve is None else model.curve.effect_name(),
-        "score": model.score,
-        "difference": model.score - best,
-        "weight": model.weight,
-        "fit_percent": None if model.left is None else model.left.tolist(),
-        "validate_percent": None if unseen is None else unseen.tolist(),
-        "status": model.status,
-    }
 
 
 def _spoken(steps: Sequence[Step]) -> list[str]:

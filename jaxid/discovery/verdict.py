@@ -54,7 +54,7 @@ def undecided(models: Sequence[Model], chosen: Model) -> str:
     if chosen.score < start.score - LIKELY:
         return ""
     return (
-        f"the model without it is only {start.score - chosen.score:.2g} behind in score, where "
+        f"the model as it was is only {start.score - chosen.score:.2g} behind in score, where "
         f"{LIKELY:.0f} are odds of 20 to 1: record more, or longer"
     )
 

@@ -58,9 +58,9 @@ def failure(story: Discovery) -> Markup:
     if len(story.steps) > 1:
         caption += " The figure of the final model, below, shows the same stretch."
     pieces: list[Content] = [along(story, held, 0, caption)]
-    if story.before.depends_on():
-        pieces.append(against(held, story.before.where[0], "the starting model"))
-    pieces.append(where_table(story.before))
+    if story.first_diagnosis.depends_on():
+        pieces.append(against(held, story.first_diagnosis.where[0], "the starting model"))
+    pieces.append(where_table(story.first_diagnosis))
     title = "Where the starting model failed" if len(story.steps) > 1 else "The model beside data"
     return section(title, *pieces)
 
@@ -110,8 +110,8 @@ def rest(story: Discovery) -> Markup:
         pieces.append(against(held, story.diagnosis.where[0], "the final model"))
         if len(story.steps) > 1:
             pieces.append(where_table(story.diagnosis))
-    elif len(story.steps) > 1 and story.before.depends_on():
-        pieces.append(against(held, story.before.where[0], "the final model"))
+    elif len(story.steps) > 1 and story.first_diagnosis.depends_on():
+        pieces.append(against(held, story.first_diagnosis.where[0], "the final model"))
     pieces.append(tag("h3", "Is it noise?"))
     pieces.append(tag("div", *whiteness(story, held, 0), class_="pair"))
     return section("What is left", *pieces)

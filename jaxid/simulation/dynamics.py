@@ -228,7 +228,7 @@ def instant(
     mass = loop.arm.mass_matrix(state.q)
     command = loop.controller.command(seen, reference, state.controller, mass)
     if loop.controller.compensates:
-        command = command + _taken(loop, t, state, command, mass, outside, label)
+        command = command + _compensation(loop, t, state, command, mass, outside, label)
     tau = loop.controller.acting(command, state.controller)
     motion = Motion(t, state.q, state.v, jnp.zeros_like(state.q), tau, jnp.zeros(0), label)
     # An effect's own states see what arrives at it, so that lags in a row compose.
@@ -249,7 +249,7 @@ def instant(
     return Instant(seen, command, motion.tau, a, State(state.v, a, tuple(rates), law))
 
 
-def _taken(
+def _compensation(
     loop: ClosedLoop,
     t: Float[Array, ""],
     state: State,
