@@ -140,6 +140,20 @@ def test_a_story_of_one_step_is_a_page_too(tmp_path: Path) -> None:
     assert "nothing is missing" in " ".join(page.shown)
 
 
+@pytest.mark.slow
+def test_what_cannot_be_told_is_a_page_that_says_why(tmp_path: Path) -> None:
+    why = "the fit of the model did not converge (a test)"
+    story = dataclasses.replace(
+        told().story, verdict="undetermined", reason=why, steps=told().story.steps[:1]
+    )
+    file = write_report(story, tmp_path / "undetermined.html")
+    shown = " ".join(Page(file.read_text(encoding="utf-8")).shown)
+    assert "These recordings do not tell what the model of scara lacks." in shown
+    assert f"T{why[1:]}." in shown
+    assert "Nothing is missing" not in shown
+    assert "The models that were looked at" in shown
+
+
 def test_text_is_escaped_unless_it_is_markup() -> None:
     assert join("<b>", Markup("<i>")) == "&lt;b&gt;<i>"
     assert tag("p", HOSTILE, class_=IMAGE) == (

@@ -291,7 +291,7 @@ class Discovery(AbstractShown):
                 + f" {p['unit']}"
                 for n, p in values.items()
             )
-            sure = f" (probability {_odds(step.probability)})"
+            sure = f" (probability {odds(step.probability)})"
             lines.append(f"{step_name(step)}{sure}: {shown}")
             if step.alike:
                 others = ", ".join(effect_on(n, j) for n, j in step.alike)
@@ -314,7 +314,7 @@ class Discovery(AbstractShown):
         )
 
 
-def _odds(share: float) -> str:
+def odds(share: float) -> str:
     """A probability that is no more certain than its digits."""
     return "> 0.999" if share > 0.999 else f"{share:.3g}"
 

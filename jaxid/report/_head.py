@@ -1,6 +1,7 @@
 """The page's head: the verdict, what it did to the error, and what was found."""
 
 from ..discovery import Discovery
+from ..discovery.story import odds
 from ._html import Markup, number, tag
 
 WORDS = {
@@ -16,7 +17,12 @@ def head(story: Discovery) -> Markup:
     badge = tag("span", WORDS[story.verdict], class_=f"badge {story.verdict}")
     kicker = tag("p", "jaxid discover: ", tag("b", story.loop.name), " ", badge, class_="kicker")
     notes = [tag("p", note, class_="note") for note in story.notes]
-    pieces = [kicker, tag("h1", story.sentence), tag("p", _lead(story), class_="lead")]
+    # A reason is too long for a headline.
+    said, _, why = story.sentence.partition(": ") if story.reason else (story.sentence, "", "")
+    pieces = [kicker, tag("h1", f"{said.rstrip('.')}.")]
+    if why:
+        pieces.append(tag("p", f"{why[:1].upper()}{why[1:]}"))
+    pieces.append(tag("p", _lead(story), class_="lead"))
     return tag("header", *pieces, tag("div", *_cards(story), class_="cards"), _found(story), *notes)
 
 
@@ -58,7 +64,8 @@ def _found(story: Discovery) -> Markup | None:
         assert step.added is not None
         where = "" if entry["joint"] is None else f" on joint {entry['joint']}"
         values = ", ".join(_value(name, **p) for name, p in entry["parameters"].items())
-        lines.append(tag("li", tag("b", f"{step.added.spoken()}{where}"), f": {values}"))
+        sure = f" (probability {odds(step.probability)})"
+        lines.append(tag("li", tag("b", f"{step.added.spoken()}{where}"), f"{sure}: {values}"))
     return tag("ul", *lines, class_="found") if lines else None
 
 

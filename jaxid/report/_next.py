@@ -61,6 +61,8 @@ def _question(story: Discovery) -> tuple[tuple[Diagnosis, list[Verdict]] | None,
             "dependence that was found, so that its form can be read off."
         )
         return (story.diagnosis, [leader]), why
+    if len(story.steps) == 1 and story.reason:
+        return None, f"These recordings do not tell: {story.reason}."
     if len(story.steps) == 1:
         return None, "Nothing is missing, so there is nothing to tell apart."
     step = story.steps[-1]
