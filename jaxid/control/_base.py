@@ -84,8 +84,8 @@ class AbstractController(eqx.Module):
         return 0.0
 
     @property
-    def compensates(self) -> bool:
-        """Whether all that the model's motion takes is added to the command.
+    def imposes(self) -> bool:
+        """Whether the reference is the motion, and the command the torque that it takes.
 
         Only a law that is made up for a simulation can do so.
         """

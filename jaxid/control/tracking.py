@@ -46,7 +46,7 @@ class Tracking(AbstractController):
         return 2 * math.pi * self.bandwidth
 
     @property
-    def compensates(self) -> bool:
+    def imposes(self) -> bool:
         """It does, so that torque does not lag behind the motion that takes it."""
         return True
 

@@ -13,6 +13,7 @@ from ..compiling import compiled
 from ..effects import AbstractEffect, AbstractTransmission, TorqueSaturation
 from ..parameters import KNOWN
 from ..simulation.batch import Batch
+from ..simulation.dynamics import imposed
 from ..simulation.integration import initial
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import each, run
@@ -53,10 +54,14 @@ class OneOf(AbstractTransmission):
         return found
 
 
-def simulated(
-    loop: ClosedLoop, batch: Batch, effects: Sequence[AbstractEffect], row: int
+def differences(
+    loop: ClosedLoop,
+    batch: Batch,
+    effects: Sequence[AbstractEffect],
+    row: int,
+    nominal: Float[Array, "recordings points joints"],
 ) -> list[Float[np.ndarray, "recordings points joints"]]:
-    """One signal of simulations with each effect in turn.
+    """What effects change of a signal, by a simulation with each of them.
 
     All transmissions and limits of all joints share a program. Finite effects of other kinds have
     one for each structure.
@@ -66,10 +71,24 @@ def simulated(
     - `effects`: each at a finite setting, and none on a joint whose drive and link are parted
       already.
     - `row`: which of `SIGNALS`.
+    - `nominal`: the signal without them, as the loop alone has it.
 
     **Returns:** one `(recordings, points, joints)` for each effect, N·m or N for a torque, rad or m
     for a position.
     """
+    if not effects:
+        return []
+    if not imposed(loop):
+        return [run - np.asarray(nominal) for run in _simulated(loop, batch, effects, row)]
+    # With them the motion is not given any more: what feedback errs by is to be in both.
+    *runs, without = _simulated(loop, batch, [*effects, TorqueSaturation(joint=1)], row)
+    return [run - without for run in runs]
+
+
+def _simulated(
+    loop: ClosedLoop, batch: Batch, effects: Sequence[AbstractEffect], row: int
+) -> list[Float[np.ndarray, "recordings points joints"]]:
+    """The signal with each effect."""
     shared = [k for k, e in enumerate(effects) if isinstance(e, _SHARED)]
     groups = [(shared, _together([effects[k] for k in shared]))] if shared else []
     others = [k for k in range(len(effects)) if k not in shared]

@@ -18,7 +18,7 @@ from ..effects import AbstractEffect
 from ..estimate.minimise import Filling, Stopping, Sums, descend
 from ..noise import ARFilter
 from ..parameters import Bounds, read_values, write_values
-from .finite import simulated
+from .finite import differences
 from .hypotheses import free_of
 from .linear import at_samples, respond
 from .score import Data, spanned
@@ -177,12 +177,11 @@ class Predictor(eqx.Module):
         by = _MOVED * np.maximum(np.abs(values), 1e-3 * scale)
         moved = [write_values(effect, free, jnp.asarray(values + d)) for d in np.diag(by)]
         system = self.system
-        runs = simulated(system.loop, system.batch, [effect, *moved], system.row)
-        nominal = np.asarray(system.linear.seen[:, :, system.row])
-        columns = [
-            runs[0] - nominal,
-            *((r - runs[0]) / d for r, d in zip(runs[1:], by, strict=True)),
-        ]
+        nominal = system.linear.seen[:, :, system.row]
+        first, *others = differences(
+            system.loop, system.batch, [effect, *moved], system.row, nominal
+        )
+        columns = [first, *((x - first) / d for x, d in zip(others, by, strict=True))]
         return at_samples(system.batch, np.stack(columns, axis=-1))
 
     def _ended(self, found: "_Reached") -> Prediction:

@@ -19,7 +19,7 @@ from ..simulation.dynamics import effect_loads
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import each
 from ..simulation.sharing import at_once, taken
-from .finite import by_structure, simulated
+from .finite import by_structure, differences
 from .hypotheses import Hypothesis, amplitudes, free_of
 from .linear import Linearised, respond
 
@@ -274,13 +274,12 @@ def signatures(
         blocks.append(_responses(loop, linear, stacks, list(made.values())))
     rest = [k for k in range(len(proposed)) if k not in made]
     say(f"{len(rest)} signatures by simulation")
-    nominal = np.asarray(linear.seen[:, :, row])
-    for place, moved in zip(
-        rest, simulated(loop, batch, [proposed[k][0] for k in rest], row), strict=True
-    ):
+    nominal = linear.seen[:, :, row]
+    changes = differences(loop, batch, [proposed[k][0] for k in rest], row, nominal)
+    for place, change in zip(rest, changes, strict=True):
         effect, tests = proposed[place]
         with np.errstate(over="ignore"):  # a loop that runs away is left out
-            column = (moved - nominal).astype(np.float32)
+            column = change.astype(np.float32)
         if np.isfinite(column).all():
             blocks.append(column[..., None])
             made[place] = Hypothesis(effect, (at,), *_amplitude_bounds(effect), tests)

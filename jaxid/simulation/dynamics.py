@@ -107,12 +107,14 @@ class Outside(eqx.Module):
     """What comes from outside the loop at one instant; vectors are `(joints,)`.
 
     `push` is torque on the drives, `pull` on the links (the same where nothing gives way between
-    them and nothing depends on the load), `noise` is added to what the sensors read.
+    them and nothing depends on the load), `noise` is added to what the sensors read, and
+    `noise_rate` is how fast that of velocity changes.
     """
 
     push: Float[Array, " joints"]
     pull: Float[Array, " joints"]
     noise: Reading
+    noise_rate: Float[Array, " joints"]
 
 
 class Instant(eqx.Module):
@@ -223,12 +225,16 @@ def instant(
     - `outside`: what acts on it.
     - `label`: which recording.
     """
+    if imposed(loop):
+        return _along_reference(loop, t, state, reference, outside, label)
     seen = read(loop, state.q, state.v)
     seen = Reading(seen.q + outside.noise.q, seen.v + outside.noise.v)
     mass = loop.arm.mass_matrix(state.q)
     command = loop.controller.command(seen, reference, state.controller, mass)
-    if loop.controller.compensates:
-        command = command + _compensation(loop, t, state, command, mass, outside, label)
+    if loop.controller.imposes:
+        a, none = solve_positive(mass, command), jnp.zeros(0)
+        motion = Motion(t, state.q, state.v, a, jnp.zeros_like(a), none, label)
+        command = command + _beside_inertia(loop, motion, state, command, outside)
     tau = loop.controller.acting(command, state.controller)
     motion = Motion(t, state.q, state.v, jnp.zeros_like(state.q), tau, jnp.zeros(0), label)
     # An effect's own states see what arrives at it, so that lags in a row compose.
@@ -249,27 +255,86 @@ def instant(
     return Instant(seen, command, motion.tau, a, State(state.v, a, tuple(rates), law))
 
 
-def _compensation(
+def imposed(loop: ClosedLoop) -> bool:
+    """Whether the motion is the reference itself, so that nothing of it needs to be simulated.
+
+    It is under a law that imposes it, but for effects that give the arm a motion of its own and for
+    drives whose torque depends on past or limited commands.
+    """
+    return loop.controller.imposes and not any(
+        isinstance(effect, AbstractTransmission)
+        or (_drives(effect) and (effect.finite or effect.initial_state().size > 0))
+        for effect in loop.effects
+    )
+
+
+def _drives(effect: AbstractEffect) -> bool:
+    return type(effect).command is not AbstractEffect.command
+
+
+def _along_reference(
     loop: ClosedLoop,
     t: Float[Array, ""],
     state: State,
-    command: Float[Array, " joints"],
-    mass: Float[Array, "joints joints"],
+    reference: Reference,
     outside: Outside,
     label: Int[Array, ""],
+) -> Instant:
+    """Inverse dynamics at one instant of the motion at which the sensors read the reference."""
+    noise, seen = outside.noise, Reading(reference.q, reference.v)
+
+    at = seen.q - noise.q, seen.v - noise.v
+    rates = seen.v - noise.v, reference.a - outside.noise_rate
+    (q, v), (_, a) = jax.jvp(lambda q, v: behind(loop, q, v), at, rates)
+    motion = Motion(t, q, v, a, jnp.zeros_like(q), jnp.zeros(0), label)
+    rigid = loop.arm.mass_matrix(q) @ a
+    tau = rigid + _beside_inertia(loop, motion, state, rigid, outside)
+    command = _commanded(loop, motion, tau) + reference.tau
+    rates, arriving = [], dataclasses.replace(motion, tau=command)
+    for effect, own in zip(loop.effects, state.effects, strict=True):
+        arriving = dataclasses.replace(arriving, state=own)
+        rates.append(effect.derivative(arriving))
+        arriving = dataclasses.replace(arriving, tau=effect.command(arriving))
+    law = loop.controller.derivative(seen, reference, state.controller)
+    return Instant(seen, command, tau, a, State(v, a, tuple(rates), law))
+
+
+def _commanded(
+    loop: ClosedLoop, motion: Motion, tau: Float[Array, " joints"]
 ) -> Float[Array, " joints"]:
-    """What a motion takes beside the torque on the arm's inertia, less what comes from outside."""
-    a, none = solve_positive(mass, command), jnp.zeros(0)
-    motion = Motion(t, state.q, state.v, a, jnp.zeros_like(a), none, label)
-    bias = loop.arm.bias(state.q, state.v) - outside.push - outside.pull
-    loaded = any(effect.loaded for effect in loop.effects)
-    if loaded:
+    """The command at which drives without memory deliver a torque, `(joints,)`: Newton's step.
+
+    Their gains are all that there is, and each joint's is its own: one step is exact.
+    """
+    drives = [effect for effect in loop.effects if _drives(effect)]
+    if not drives:
+        return tau
+
+    def delivered(command: Float[Array, " joints"]) -> Float[Array, " joints"]:
+        for effect in drives:
+            command = effect.command(dataclasses.replace(motion, tau=command))
+        return command
+
+    now, gain = jax.jvp(delivered, (tau,), (jnp.ones_like(tau),))
+    return tau + (tau - now) / gain
+
+
+def _beside_inertia(
+    loop: ClosedLoop,
+    motion: Motion,
+    state: State,
+    rigid: Float[Array, " joints"],
+    outside: Outside,
+) -> Float[Array, " joints"]:
+    """What a motion takes beside `rigid`, on the arm's inertia, less what comes from outside."""
+    bias = loop.arm.bias(motion.q, motion.v) - outside.push - outside.pull
+    if any(effect.loaded for effect in loop.effects):
         # What depends on the load is given the torque that the motion takes without it.
         pairs = zip(loop.effects, state.effects, strict=True)
         kept = [(e, s) for e, s in pairs if not e.loaded]
         others = loop.with_effects([e for e, _ in kept])
         drive, link = effect_loads(others, motion, tuple(s for _, s in kept))
-        motion = dataclasses.replace(motion, tau=command + bias + drive + link)
+        motion = dataclasses.replace(motion, tau=rigid + bias + drive + link)
     drive, link = effect_loads(loop, motion, state.effects, push=outside.push)
     return bias + drive + link
 

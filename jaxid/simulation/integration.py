@@ -30,7 +30,17 @@ from .by_interval import (
     one_of,
     together,
 )
-from .dynamics import Instant, Outside, State, behind, instant, rest, settle, unflatten
+from .dynamics import (
+    Instant,
+    Outside,
+    State,
+    behind,
+    imposed,
+    instant,
+    rest,
+    settle,
+    unflatten,
+)
 from .loop import ClosedLoop
 from .stepping import ready
 from .unrolling import unrolled
@@ -63,7 +73,10 @@ def instant_at(loop: ClosedLoop, interval: Interval, t: Float[Array, ""], state:
         _line(ends, dt, interval.h, loop.joints)
         for ends in (interval.noise, interval.rate, interval.push, interval.pull)
     )
-    outside = Outside(push, pull, Reading(noise, rate))
+    bend = jnp.zeros(loop.joints)
+    if interval.rate is not None:
+        bend = (interval.rate[1] - interval.rate[0]) / jnp.where(interval.h > 0, interval.h, 1.0)
+    outside = Outside(push, pull, Reading(noise, rate), bend)
     return instant(loop, t, state, _reference(interval, dt), outside, interval.label)
 
 
@@ -98,7 +111,8 @@ def observe(
         seen = (now.command, now.reading.q, now.reading.v, now.a, now.tau)
         return ravel_pytree(state)[0], jnp.stack([seen[row] for row in rows])
 
-    return unrolled(begin, interval, x)(interval, x)
+    # Along a motion that is given, instants are independent, and arrays of many at once.
+    return begin(interval, x) if imposed(loop) else unrolled(begin, interval, x)(interval, x)
 
 
 # --- one solve ----------------------------------------------------------------------------------
@@ -202,6 +216,8 @@ def integrate(
     - `intervals`: between grid points; the last, which has no length, ends the run.
     - `substeps`: in place of the settings' own, for programs that serve any number of them.
     """
+    if given(loop):
+        return states_of_reference(loop, intervals, x0), success()
     through = jax.tree.map(lambda leaf: leaf[:-1], intervals)
     rate = _rate(loop, through, x0)
     if loop.stepping.plain:
@@ -210,6 +226,24 @@ def integrate(
     solution = _solve(loop, rate, through, x0, saveat, substeps)
     assert solution.ys is not None
     return solution.ys, _number(solution.result)
+
+
+def given(loop: ClosedLoop) -> bool:
+    """Whether the recordings give all states, so that there is nothing to integrate."""
+    return imposed(loop) and not any(effect.initial_state().size for effect in loop.effects)
+
+
+def states_of_reference(
+    loop: ClosedLoop, intervals: Interval, x0: Float[Array, " states"]
+) -> Float[Array, "points states"]:
+    """The states at grid points where the reference is the motion."""
+
+    def at(interval: Interval) -> Float[Array, " states"]:
+        now = _reference(interval, jnp.zeros(()))
+        q, v = behind(loop, now.q, now.v)
+        return ravel_pytree(dataclasses.replace(unflatten(loop)(x0), q=q, v=v))[0]
+
+    return jax.vmap(at)(intervals)
 
 
 def integrate_with_tangents(
@@ -256,6 +290,8 @@ def through_interval(
 
     - `alive`: False where there is nothing left to solve.
     """
+    if given(loop):
+        return x, success()
     alone = jax.tree.map(lambda leaf: leaf[None], interval)
     rate = _rate(loop, alone, x)
     if loop.stepping.plain:

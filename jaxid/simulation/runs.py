@@ -13,7 +13,9 @@ from jaxtyping import Array, Float, Int
 from ..compiling import compiled
 from ..recording import Recording, Recordings
 from .batch import Batch, Interval, check_law, prepare
+from .dynamics import imposed
 from .integration import (
+    given,
     initial,
     integrate,
     integrate_with_tangents,
@@ -100,8 +102,13 @@ def run(
         states, seen, code = _ticking(loop, intervals, x0, substeps, rows)
     else:
         states, code = integrate(loop, intervals, x0, substeps)
-        seen = each(lambda i, x: observe(loop, i, x, rows)[1], intervals, states)
+        seen = _at_points(loop, lambda i, x: observe(loop, i, x, rows)[1], intervals, states)
     return states, seen, unless_finite(code, states[-1])
+
+
+def _at_points(loop: ClosedLoop, fun: Callable, *args):
+    """A function of every grid point, all together where the motion is given."""
+    return jax.vmap(fun)(*args) if imposed(loop) else each(fun, *args)
 
 
 def _ticking(loop, intervals, x0, substeps, rows):
@@ -158,14 +165,14 @@ def run_with_sensitivities(
     - `rows`: which of `SIGNALS`.
     """
     loop, columns = with_rolled_stages(loop), start.shape[1]
-    if loop.stepping.plain and loop.controller.period is None:
+    if loop.stepping.plain and loop.controller.period is None and not given(loop):
         states, tangents = integrate_with_tangents(loop, intervals, x0, start)
 
         def at(interval, x, tangents):
             shown = lambda loop, x: observe(loop, interval, x, rows)[1]  # noqa: E731
             return with_tangents(shown, loop, columns)(x, tangents)
 
-        seen, slopes = each(at, intervals, states, tangents)
+        seen, slopes = _at_points(loop, at, intervals, states, tangents)
         code = unless_finite(success(), states[-1])
         return Sensitivities(seen, slopes, states[-1], tangents[-1], code)
     theta, loop = loop.theta, with_forward_mode(loop)

@@ -18,6 +18,7 @@ from ..errors import JaxidWarning, ModelError
 from ..recording import Recordings
 from .batch import check_joints
 from .dynamics import Outside, instant, rest, unflatten
+from .integration import given
 from .loop import ClosedLoop
 from .stepping import RK4
 
@@ -45,7 +46,7 @@ def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     period = loop.controller.period
     longest = max(r.period for r in recordings)
     interval = longest if period is None else min(longest, period)
-    if isinstance(loop.stepping.solver, diffrax.AbstractImplicitSolver):
+    if given(loop) or isinstance(loop.stepping.solver, diffrax.AbstractImplicitSolver):
         still, moving = 0.0, 0.0
     else:
         still, moving = _rates(loop, recordings)
@@ -186,7 +187,7 @@ def _slopes(
     def rate(x, at, speed):
         reference = Reference(at, speed, zeros, zeros)
         state = unflatten(loop)(x)
-        outside = Outside(zeros, zeros, Reading(zeros, zeros))
+        outside = Outside(zeros, zeros, Reading(zeros, zeros), zeros)
         now = instant(loop, jnp.zeros(()), state, reference, outside, jnp.asarray(NOBODY))
         return ravel_pytree(now.derivative)[0]
 
