@@ -50,6 +50,7 @@ from .recording import Recordings as Recordings  # noqa: E402
 from .recording import read as read  # noqa: E402
 from .robots import emps as emps  # noqa: E402
 from .robots import scara as scara  # noqa: E402
+from .robots import serial as serial  # noqa: E402
 from .robots import two_link as two_link  # noqa: E402
 from .simulation.loop import ClosedLoop as ClosedLoop  # noqa: E402
 from .simulation.runs import simulate as simulate  # noqa: E402

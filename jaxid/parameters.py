@@ -85,7 +85,8 @@ class Parameter(eqx.Module):
     """One parameter of a model: its declaration, its unique name and where it lives.
 
     A field that holds several values (the coefficients of a curve) is one parameter with `size`
-    above one.
+    above one. Its values are called by number, or by the `labels` that the owner's `field_names`
+    holds.
     """
 
     name: str = eqx.field(static=True)
@@ -94,6 +95,7 @@ class Parameter(eqx.Module):
     joint: int | None = eqx.field(static=True, default=None)
     size: int = eqx.field(static=True, default=1)
     several: bool = eqx.field(static=True, default=False)
+    labels: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def place(self) -> Place:
@@ -105,6 +107,8 @@ class Parameter(eqx.Module):
         """One name for each value."""
         if not self.several:
             return [self.name]
+        if self.labels:
+            return list(self.labels)
         return [f"{self.name}[{k}]" for k in range(1, self.size + 1)]
 
 
@@ -166,9 +170,9 @@ def _listed(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Parame
             number += 1
             name = f"{symbol}_{number}"
         taken.add(name)
-        found.append(
-            Parameter(name, declaration, where, joint, math.prod(value.shape), bool(value.shape))
-        )
+        size, several = math.prod(value.shape), bool(value.shape)
+        labels = tuple(getattr(owner, f"{field}_names", ()))
+        found.append(Parameter(name, declaration, where, joint, size, several, labels))
     return tuple(found)
 
 
@@ -231,9 +235,11 @@ def set_by_name(model: Any, **values: float) -> Any:
 def _whole(model: Any, known: dict[str, Parameter], values: dict[str, float]) -> dict[str, Any]:
     """Values by parameter, those given as `name[1]` put into what the model holds."""
     found: dict[str, Any] = {}
+    labelled = {n: (p.name, k) for p in known.values() for k, n in enumerate(p.labels, start=1)}
     for name, value in values.items():
         indexed = re.fullmatch(r"(.+)\[(\d+)\]", name)
         whole, place = (indexed[1], int(indexed[2])) if indexed else (name, 0)
+        whole, place = labelled.get(name, (whole, place))
         if whole in known and 1 <= place <= known[whole].size:
             had = found.get(whole, np.asarray(known[whole].where(model), float))
             found[whole] = np.ravel(had).copy()

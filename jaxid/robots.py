@@ -1,8 +1,13 @@
 """Ready robots: arm, friction, controller and start values of the papers."""
 
-from .arms import SCARA, Axis, TwoLink
-from .control import PD, AbstractController, Cascade
-from .effects import Coulomb, TorqueOffset, Viscous
+import os
+from typing import Any
+
+from .arms import SCARA, Axis, SerialArm, TwoLink
+from .arms.urdf import read_urdf
+from .control import PD, AbstractController, Cascade, Tracking
+from .effects import Coulomb, RotorInertia, TorqueOffset, Viscous
+from .errors import ModelError
 from .simulation.loop import ClosedLoop
 
 
@@ -49,3 +54,53 @@ def emps(controller: AbstractController | None = None) -> ClosedLoop:
     # At these speeds the sign's sharpness shows in the force, and nobody knows it: fits find it.
     law = controller or Cascade()
     return ClosedLoop(Axis(), law, effects, name="emps").free("gamma1")
+
+
+def serial(
+    source: str | os.PathLike[str],
+    controller: AbstractController | None = None,
+    *,
+    rotors: tuple[float, ...] | None = None,
+    gears: Any = None,
+    bodies: str = "drawn",
+    base: str | None = None,
+    tip: str | None = None,
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
+) -> ClosedLoop:
+    """An arm from its URDF, with friction, a torque offset and a rotor on every joint.
+
+    **Arguments:**
+
+    - `source`: path of the URDF, or its text.
+    - `controller`: its law; where None it is not known, `Tracking()`.
+    - `rotors`: inertia of each drive at its joint, kg·m² or kg; estimated from zero where None.
+    - `gears`: turns of each motor for those of each joint, `(joints, joints)`, where motors drive
+      more than their own joint.
+    - `bodies`: `"drawn"` to leave the links' bodies as the file has them, `"free"` to estimate
+      their base parameters.
+    - `base`, `tip`, `gravity`: as for `SerialArm.from_urdf`.
+
+    **Raises:** `ModelError` for a file that describes no serial arm.
+    """
+    if bodies not in ("drawn", "free"):
+        raise ModelError(f"there is no choice {bodies!r} for bodies: give 'drawn' or 'free'")
+    found = read_urdf(source, base, tip)
+    arm = SerialArm.of(found, gravity, gears)
+    n = arm.joints
+    if rotors is not None and len(rotors) != n:
+        raise ModelError(f"rotors are given for {len(rotors)} of {n} joints: give one for each")
+    own = rotors or (0.0,) * n
+    # Along a given motion a sharp sign costs nothing, and one that is too soft leaves its own shape.
+    effects = (
+        *_friction(n, gamma=1e4),
+        *(TorqueOffset(joint=j) for j in range(1, n + 1)),
+        *(RotorInertia(joint=j, inertia=own[j - 1]) for j in range(1, n + 1)),
+    )
+    loop = ClosedLoop(arm, controller or Tracking(), effects, name=found.name)
+    held = [p.name for p in loop.parameters if p.declaration.symbol == "base"]
+    if bodies == "free":
+        # The first rotor's inertia, and others', are parts of base parameters.
+        held = [f"Ia{j}" for j, inside in enumerate(arm.hold_rotor(), start=1) if inside]
+    elif rotors is not None:
+        held += [f"Ia{j}" for j in range(1, n + 1)]
+    return loop.hold(*held)

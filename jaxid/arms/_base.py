@@ -45,6 +45,12 @@ class AbstractArm(eqx.Module):
     ) -> Float[Array, " joints"]:
         """Coriolis, centrifugal and gravity torque, `(joints,)`, N·m or N."""
 
+    def inverse(
+        self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
+    ) -> Float[Array, " joints"]:
+        """Torque that a motion takes, `(joints,)`, N·m or N."""
+        return self.mass_matrix(q) @ a + self.bias(q, v)
+
     def regressor(
         self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
     ) -> Float[Array, "joints parameters"]:
@@ -58,7 +64,7 @@ class AbstractArm(eqx.Module):
 
         def torque(values):
             arm = write_values(self, parameters, values)
-            return arm.mass_matrix(q) @ a + arm.bias(q, v)
+            return arm.inverse(q, v, a)
 
         return jax.jacfwd(torque)(read_values(self, parameters))
 
@@ -89,6 +95,14 @@ class AbstractArm(eqx.Module):
     def prismatic(self) -> tuple[bool, ...]:
         """Which joints slide, one a joint; the others turn."""
         return (False,) * self.joints
+
+    def planar(self) -> bool:
+        """Whether its links move in one plane, their angles there the sums of the joints'."""
+        return True
+
+    def couplings(self) -> tuple[tuple[int, int, float], ...]:
+        """Pairs of joints whose speeds some shaft may add, and its turns for one of the first."""
+        return ()
 
     def link_lengths(self) -> tuple[float, ...]:
         """Lengths of the links before the last, m; without them no payload is looked for."""

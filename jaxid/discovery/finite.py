@@ -142,7 +142,7 @@ def _one_of(options: tuple[AbstractTransmission, ...], chosen: int) -> OneOf:
     return OneOf(joint=joint, options=options, chosen=number)  # type: ignore[reportCallIssue]
 
 
-def by_structure(effects: Sequence[AbstractEffect]) -> list[list[int]]:
+def by_structure(effects: Sequence[eqx.Module]) -> list[list[int]]:
     """Places of effects of equal structure together: one trace serves all of them."""
     groups: dict[Any, list[int]] = {}
     for k, effect in enumerate(effects):

@@ -92,6 +92,8 @@ def survey(
         float(loop.arm.gravity()),
         tuple(loop.arm.prismatic()),
         tuple(loop.arm.first_moments()),
+        loop.arm.planar(),
+        tuple(loop.arm.couplings()),
     )
 
 

@@ -22,7 +22,7 @@ from .finite import differences
 from .hypotheses import free_of
 from .linear import at_samples, respond
 from .score import Data, spanned
-from .signatures import force_and_slopes
+from .signatures import Placed, force_and_slopes
 from .system import System
 
 # Columns that one response has: of fewer, some are zero, so that few programs are compiled.
@@ -154,7 +154,8 @@ class Predictor(eqx.Module):
         if effect.finite:
             return self._by_simulation(effect)
         system = self.system
-        push, noise, rate = force_and_slopes(effect, system.linear.motion, system.left)
+        placed = Placed.of(effect, system.loop.joints)
+        push, noise, rate = force_and_slopes(placed, system.linear.motion, system.left)
         place = "pull" if effect.on_link and "pull" in system.linear.places else "push"
         shown = self._through(place, push)
         if type(effect).read is not AbstractEffect.read:

@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..display.progress import working
-from ..effects import AbstractTransmission
+from ..effects import AbstractEffect, AbstractTransmission
 from ..effects import catalogue as known
 from ..errors import FitError
 from ..estimate import Fit
+from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from .comparison import Comparison
 from .diagnosis import Diagnosis
@@ -71,6 +72,7 @@ def screen(fit: Fit | Comparison, catalogue: Sequence[Any], say: Callable[[str],
         (effect, tests)
         for effect, tests in proposed
         if not (isinstance(effect, AbstractTransmission) and effect.joint in parted)
+        and _can_be_told(loop, effect)
     ]
     proposed += [(curve, 1.0) for curve in curves(scene, linear.motion)]
     hypotheses, table = signatures(loop, system.batch, linear, proposed, system.row, say)
@@ -83,6 +85,16 @@ def screen(fit: Fit | Comparison, catalogue: Sequence[Any], say: Callable[[str],
     )
     say(f"scoring {len(hypotheses)} hypotheses")
     return Screened(system, tuple(hypotheses), data, scene)
+
+
+def _can_be_told(loop: ClosedLoop, effect: AbstractEffect) -> bool:
+    """Whether the recordings can show an effect through this loop.
+
+    What gives an arm a motion of its own, or a drive a memory, is seen through a law that is
+    simulated. In space the one that is made up for an unknown one costs minutes to compile, and
+    what it shows is its own answer more than the arm's.
+    """
+    return loop.arm.planar() or not imposed(loop) or imposed(loop.add(effect))
 
 
 def _check_finite(

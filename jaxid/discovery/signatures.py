@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..compiling import compiled
 from ..effects import AbstractEffect, Motion
@@ -70,6 +70,35 @@ def _relaxed(
     return exponential(matrix.at[:n, n].set(rate).at[:n, n + 1].set(change))[:n, n]
 
 
+class Placed(eqx.Module):
+    """An effect as if its joints were the first, and which joints those are.
+
+    The order of the joints is data, so that one program serves an effect on any of them.
+    """
+
+    effect: AbstractEffect
+    order: Int[Array, " joints"]
+
+    @classmethod
+    def of(cls, effect: AbstractEffect, joints: int) -> "Placed":
+        """An effect of an arm; one that does not say which joints it depends on stays as it is."""
+        own = [getattr(effect, name) for name in effect.joint_fields]
+        first = list(dict.fromkeys(own))
+        others = [j for j in range(1, joints + 1) if j not in first]
+        moved = {n: first.index(j) + 1 for n, j in zip(effect.joint_fields, own, strict=True)}
+        made = dataclasses.replace(effect, **moved) if moved else effect
+        return cls(made, jnp.asarray([j - 1 for j in (*first, *others)]))
+
+    def motion(self, motion: Motion) -> Motion:
+        """A motion with the effect's joints first."""
+        moved = {name: getattr(motion, name)[..., self.order] for name in ("q", "v", "a", "tau")}
+        return dataclasses.replace(motion, **moved)
+
+    def back(self, forces: Any) -> Any:
+        """What was found of the joints in that order, `(points, joints, ...)`, in the arm's."""
+        return jax.tree.map(lambda x: x[:, jnp.argsort(self.order)], forces)
+
+
 Forces = tuple[
     Float[Array, "*points joints columns"],
     Float[Array, "*points joints columns"],
@@ -117,7 +146,7 @@ def _force_by(
 
 @compiled
 def force_and_slopes(
-    effect: AbstractEffect, motion: Motion, left: Float[Array, "recordings points joints"]
+    placed: Placed, motion: Motion, left: Float[Array, "recordings points joints"]
 ) -> Forces:
     """What an effect adds along each run, and the slopes of that by its free parameters.
 
@@ -128,13 +157,15 @@ def force_and_slopes(
     **Returns:** torque on the joint, N·m or N, position read, rad or m, and velocity read, rad/s or
     m/s; the first column is the value, the others are slopes.
     """
+    effect = placed.effect
     free = free_of(effect)
     values = read_values(effect, free)
 
     def of_run(run: Motion, left) -> Forces:
-        along = _force_by(effect, free, run, left)
+        along = _force_by(effect, free, placed.motion(run), left[:, placed.order])
         both = along(values), jax.jacfwd(along)(values)
-        return jax.tree.map(lambda x, d: jnp.concatenate([x[..., None], d], -1), *both)
+        found = jax.tree.map(lambda x, d: jnp.concatenate([x[..., None], d], -1), *both)
+        return placed.back(found)
 
     return each(of_run, motion, left)
 
@@ -155,7 +186,7 @@ def left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings
 
 @compiled
 def _all_forces(
-    groups: list[AbstractEffect],
+    groups: list[Placed],
     motion: Motion,
     left: Float[Array, "recordings points joints"],
 ) -> AllForces:
@@ -168,16 +199,15 @@ def _all_forces(
     def of_run(run: Motion, left) -> AllForces:
         pushes, noises, rates = [], [], []
         for stacked in groups:
-            if jax.tree.leaves(stacked):
-                own = eqx.filter_vmap(
-                    lambda effect: _forces(effect, run, left), in_axes=eqx.if_array(0)
-                )
-                forces = own(stacked)
-            else:  # a law without any number of its own
-                forces = jax.tree.map(lambda x: x[None], _forces(stacked, run, left))
+
+            def own(placed: Placed) -> Forces:
+                moved, rest = placed.motion(run), left[:, placed.order]
+                return placed.back(_forces(placed.effect, moved, rest))
+
+            forces = eqx.filter_vmap(own, in_axes=eqx.if_array(0))(stacked)
             push, noise, rate = (_by_point(x.astype(jnp.float32)) for x in forces)
             pushes.append(push)
-            if _misreads(stacked):
+            if _misreads(stacked.effect):
                 noises.append(noise)
                 rates.append(rate)
         none = [jnp.zeros((*left.shape, 0), jnp.float32)]
@@ -200,18 +230,19 @@ def _misreads(effect: AbstractEffect) -> bool:
     return type(effect).read is not AbstractEffect.read
 
 
-def _grouped(effects: Sequence[AbstractEffect]) -> list[tuple[AbstractEffect, list[int]]]:
-    """Effects of equal structure stacked, with their places."""
+def _grouped(effects: Sequence[AbstractEffect], joints: int) -> list[tuple[Placed, list[int]]]:
+    """Effects that a program serves together stacked, with their places."""
+    placed = [Placed.of(effect, joints) for effect in effects]
     return [
-        (jax.tree.map(lambda *leaves: jnp.stack(leaves), *(effects[k] for k in places)), places)
-        for places in by_structure(effects)
+        (jax.tree.map(lambda *leaves: jnp.stack(leaves), *(placed[k] for k in places)), places)
+        for places in by_structure(placed)
     ]
 
 
 def _responses(
     loop: ClosedLoop,
     linear: Linearised,
-    stacks: list[AbstractEffect],
+    stacks: list[Placed],
     hypotheses: Sequence[Hypothesis],
 ) -> Float[np.ndarray, "recordings points outputs columns"]:
     """What effects that are inputs of the linear system show, one run after the other.
@@ -260,7 +291,7 @@ def signatures(
     direct = [k for k, (effect, _) in enumerate(proposed) if not effect.finite]
     made: dict[int, Hypothesis] = {}
     blocks, at = [], 0
-    groups = _grouped([proposed[k][0] for k in direct])
+    groups = _grouped([proposed[k][0] for k in direct], loop.joints)
     if groups:
         say(f"{len(direct)} signatures by linear response")
         for _, places in groups:

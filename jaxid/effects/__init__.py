@@ -9,6 +9,8 @@ from ._base import on_joint as on_joint
 from ._base import recording_label as recording_label
 from ._base import smooth_sign as smooth_sign
 from ._scene import Scene as Scene
+from .counterbalance import Counterbalance as Counterbalance
+from .coupling import SharedShaft as SharedShaft
 from .curve import Curve as Curve
 from .disturbance import PeriodicDisturbance as PeriodicDisturbance
 from .drive import ActuatorLag as ActuatorLag
@@ -56,8 +58,10 @@ catalogue: tuple[type[AbstractEffect], ...] = (
     Gravity,
     Tilt,
     Spring,
+    Counterbalance,
     Payload,
     RotorInertia,
+    SharedShaft,
     ThermalDrift,
     PeriodicDisturbance,
     EndStop,

@@ -59,6 +59,8 @@ class AbstractEffect(eqx.Module):
     - `finite`: it has no derivative at nothing, or one that says little of what it does: screened
       by simulations with it.
     - `on_link`: `torque` acts on the link, beyond what gives way between it and its drive.
+    - `joint_fields`: names of the fields that number joints, of an effect that depends on no other
+      joints and acts on no others: one program then serves all joints (none by default).
     - `contact`: it parts and meets again, so that a shape held at a wrong value (how stiff it is)
       leaves a fit in a wrong valley.
     """
@@ -68,6 +70,7 @@ class AbstractEffect(eqx.Module):
     loaded: ClassVar[bool] = False
     finite: ClassVar[bool] = False
     on_link: ClassVar[bool] = False
+    joint_fields: ClassVar[tuple[str, ...]] = ()
     contact: ClassVar[bool] = False
 
     @classmethod

@@ -14,7 +14,8 @@ class Scene(eqx.Module):
     - `period`, `duration`: of the recordings, s. `recordings`: their names.
     - `tones`: frequencies that stand out of the residual's spectrum, Hz.
     - `lengths`: of the links before the last, m; `g`: gravity in their plane, m/s².
-    - `slides`: whether a joint slides.
+    - `slides`: whether a joint slides. `planar`: whether links move in one plane.
+    - `couplings`: pairs of joints whose speeds a shaft may add, and its turns for one of the first.
     - `moments`: first moments of each link in its own frame, kg·m; None where not known.
     """
 
@@ -32,6 +33,8 @@ class Scene(eqx.Module):
     g: float
     slides: tuple[bool, ...]
     moments: tuple[tuple[float, float] | None, ...]
+    planar: bool = True
+    couplings: tuple[tuple[int, int, float], ...] = ()
 
     @property
     def joints(self) -> range:

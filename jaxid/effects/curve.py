@@ -24,6 +24,7 @@ class Curve(AbstractEffect):
     - `signed`: times the sign of this joint's velocity, as friction.
     """
 
+    joint_fields = ("joint", "of")
     joint: int = eqx.field(static=True)
     coordinate: Coordinate = eqx.field(static=True)
     of: int = eqx.field(static=True, default=1)

@@ -15,6 +15,7 @@ from ._scene import Scene
 class DriveGain(AbstractEffect):
     """A wrong torque constant of one drive: it delivers (1 + g) times the command."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     gain: Scalar = parameter(0.0, symbol="gain", unit="1", lower=-0.9, scale=0.1)
 
@@ -26,6 +27,7 @@ class DriveGain(AbstractEffect):
 class ActuatorLag(AbstractEffect):
     """A first-order current loop: T tau' + tau = command."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     time_constant: Scalar = parameter(
         0.0, symbol="Tlag", unit="s", lower=0.0, scale=0.01, linear=False
@@ -67,6 +69,7 @@ class TimeDelay(AbstractEffect):
     part that arrives at once.
     """
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     delay: Scalar = parameter(0.0, symbol="delay", unit="s", lower=0.0, scale=0.01, linear=False)
 
@@ -106,6 +109,7 @@ class TimeDelay(AbstractEffect):
 class TorqueSaturation(AbstractEffect):
     """The drive's limit: torque beyond it is cut off."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     limit: Scalar = parameter(
         jnp.inf, symbol="limit", unit="N·m", lower=0.0, scale=1.0, linear=False

@@ -23,6 +23,7 @@ def sharpness() -> Any:
 class Viscous(AbstractEffect):
     """Friction in proportion to speed: Fv v."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     coefficient: Scalar = parameter(0.0, symbol="Fv", unit="N·m·s/rad", lower=0.0, scale=0.05)
 
@@ -34,6 +35,7 @@ class Viscous(AbstractEffect):
 class Coulomb(AbstractEffect):
     """Dry friction, smoothed: Fc sigma(v), sigma = 2/pi arctan(gamma v) (Brunot et al. 2016)."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     level: Scalar = parameter(0.0, symbol="Fc", unit="N·m", lower=0.0, scale=0.1)
     gamma: Scalar = sharpness()
@@ -47,6 +49,7 @@ class Coulomb(AbstractEffect):
 class Stribeck(AbstractEffect):
     """Friction that falls with speed: Fs exp(-(v/vs)²) sigma(v) (Armstrong-Hélouvry 1991)."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     level: Scalar = parameter(0.0, symbol="Fs", unit="N·m", lower=0.0, scale=0.1)
     velocity: Scalar = parameter(
@@ -82,6 +85,7 @@ class AsymmetricFriction(AbstractEffect):
     Forward it adds dFv to viscous and dFc to Coulomb friction, backward it takes them off.
     """
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     viscous: Scalar = parameter(0.0, symbol="dFv", unit="N·m·s/rad", scale=0.05)
     coulomb: Scalar = parameter(0.0, symbol="dFc", unit="N·m", scale=0.1)
@@ -102,6 +106,7 @@ class AsymmetricFriction(AbstractEffect):
 class QuadraticDrag(AbstractEffect):
     """Drag that grows with the square of speed: Fq v |v| (fluid, fan-cooled motors)."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     coefficient: Scalar = parameter(0.0, symbol="Fq", unit="N·m·s²/rad²", lower=0.0, scale=0.01)
 

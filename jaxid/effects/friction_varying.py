@@ -20,6 +20,7 @@ class LoadDependentFriction(AbstractEffect):
     tau_link = tau - alpha |tau_link| sigma(v), which is solved here.
     """
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     ratio: Scalar = parameter(0.0, symbol="alpha", unit="1", lower=0.0, upper=0.95, scale=0.1)
     gamma: Scalar = sharpness()
@@ -46,6 +47,7 @@ class PositionDependentFriction(AbstractEffect):
     as half a turn, so that friction may rise from one end to the other.
     """
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     A1: Scalar = parameter(0.0, symbol="FA1_", unit="N·m", scale=0.1)
     B1: Scalar = parameter(0.0, symbol="FB1_", unit="N·m", scale=0.1)
@@ -78,6 +80,7 @@ class PositionDependentFriction(AbstractEffect):
 class ThermalDrift(AbstractEffect):
     """Friction that relaxes as the joint warms: (Fvt v + Fct sigma(v)) exp(-t/T)."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     viscous: Scalar = parameter(0.0, symbol="Fvt", unit="N·m·s/rad", scale=0.05)
     coulomb: Scalar = parameter(0.0, symbol="Fct", unit="N·m", scale=0.1)
@@ -105,6 +108,7 @@ class ThermalDrift(AbstractEffect):
 class Hysteresis(AbstractEffect):
     """Presliding friction after Dahl 1968: Fh z, with z' = (v - |v| z) / slide."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     level: Scalar = parameter(0.0, symbol="Fh", unit="N·m", lower=0.0, scale=0.1)
     slide: Scalar = parameter(
@@ -140,6 +144,7 @@ class LuGre(AbstractEffect):
     Fh (z + d z'), with z' = (v - |v| z / g(v)) / slide and g = 1 + r exp(-(v/vs)²).
     """
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     level: Scalar = parameter(0.0, symbol="Fh", unit="N·m", lower=0.0, scale=0.1)
     slide: Scalar = parameter(

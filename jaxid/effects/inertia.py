@@ -15,6 +15,7 @@ from ._scene import Scene
 class RotorInertia(AbstractEffect):
     """Inertia of a drive behind its gear: J a; joint 2 and further."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     inertia: Scalar = parameter(0.0, symbol="Ia", unit="kg·m²", lower=0.0, scale=0.05)
     inertial = True
@@ -54,7 +55,7 @@ class Payload(AbstractEffect):
         """
         slides = all(scene.slides)
         known = slides or len(scene.lengths) == len(scene.slides) - 1
-        if len(scene.recordings) < 2 or not known or any(scene.slides) != slides:
+        if len(scene.recordings) < 2 or not scene.planar or not known or any(scene.slides) != slides:
             return []
         reaches = (0.0,) if slides else (0.1, 0.2, 0.35, 0.5)
         return [

@@ -15,6 +15,7 @@ from ._scene import Scene
 class TorqueRipple(AbstractEffect):
     """Cogging and gear ripple: A cos(n q) + B sin(n q), n unknown."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     A: Scalar = parameter(0.0, symbol="RA", unit="N·m", scale=0.1)
     B: Scalar = parameter(0.0, symbol="RB", unit="N·m", scale=0.1)
@@ -42,6 +43,7 @@ class TorqueRipple(AbstractEffect):
 class TorqueOffset(AbstractEffect):
     """A constant torque at one joint: amplifier offset, a balance weight that is off."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     level: Scalar = parameter(0.0, symbol="offset", unit="N·m", scale=0.1)
 
@@ -53,6 +55,7 @@ class TorqueOffset(AbstractEffect):
 class Spring(AbstractEffect):
     """Hoses and cables: k (q - q0), with the preload k q0 as parameter."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     stiffness: Scalar = parameter(0.0, symbol="k", unit="N·m/rad", scale=0.1)
     preload: Scalar = parameter(0.0, symbol="kq0_", unit="N·m", scale=0.1)
@@ -70,6 +73,7 @@ class EndStop(AbstractEffect):
     `side` is 1 for the upper end, -1 for the lower.
     """
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     stiffness: Scalar = parameter(0.0, symbol="ke", unit="N·m/rad", lower=0.0, scale=1.0)
     angle: Scalar = parameter(0.0, symbol="qe", unit="rad", scale=0.1, linear=False)
@@ -106,7 +110,7 @@ class Gravity(AbstractEffect):
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Gravity"]:
         """One, for arms that turn; on a sliding joint gravity is an offset."""
-        if any(scene.slides):
+        if any(scene.slides) or not scene.planar:
             return []
         zeros = (0.0,) * len(scene.slides)
         return [cls(zeros, zeros)]
@@ -141,7 +145,8 @@ class Tilt(AbstractEffect):
     def screened(cls, scene: Scene) -> Iterable["Tilt"]:
         """First moments from that of the last link to sixteen times it, where it is not known."""
         known = [m for m in scene.moments if m is not None]
-        if any(scene.slides) or not known or None in scene.moments[1:]:
+        flat = scene.planar and not any(scene.slides)
+        if not flat or not known or None in scene.moments[1:]:
             return []
         if scene.moments[0] is not None:
             return [cls(moments=scene.moments)]

@@ -11,6 +11,7 @@ from ._base import AbstractEffect
 class EncoderEccentricity(AbstractEffect):
     """An encoder disc off its centre: q is read as q + A sin q + B cos q."""
 
+    joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     A: Scalar = parameter(0.0, symbol="EA", unit="rad", scale=0.01)
     B: Scalar = parameter(0.0, symbol="EB", unit="rad", scale=0.01)

@@ -186,9 +186,8 @@ def inverse(
     loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...]
 ) -> Float[Array, " joints"]:
     """Torque at the joints that a motion takes (the inverse dynamic model), `(joints,)`."""
-    rigid = loop.arm.mass_matrix(motion.q) @ motion.a + loop.arm.bias(motion.q, motion.v)
     drive, link = effect_loads(loop, motion, states)
-    return rigid + drive + link
+    return loop.arm.inverse(motion.q, motion.v, motion.a) + drive + link
 
 
 def _added_inertia(
@@ -234,7 +233,8 @@ def instant(
     if loop.controller.imposes:
         a, none = solve_positive(mass, command), jnp.zeros(0)
         motion = Motion(t, state.q, state.v, a, jnp.zeros_like(a), none, label)
-        command = command + _beside_inertia(loop, motion, state, command, outside)
+        rigid = command + loop.arm.bias(state.q, state.v)
+        command = rigid + _beside_bodies(loop, motion, state, rigid, outside)
     tau = loop.controller.acting(command, state.controller)
     motion = Motion(t, state.q, state.v, jnp.zeros_like(state.q), tau, jnp.zeros(0), label)
     # An effect's own states see what arrives at it, so that lags in a row compose.
@@ -287,8 +287,8 @@ def _along_reference(
     rates = seen.v - noise.v, reference.a - outside.noise_rate
     (q, v), (_, a) = jax.jvp(lambda q, v: behind(loop, q, v), at, rates)
     motion = Motion(t, q, v, a, jnp.zeros_like(q), jnp.zeros(0), label)
-    rigid = loop.arm.mass_matrix(q) @ a
-    tau = rigid + _beside_inertia(loop, motion, state, rigid, outside)
+    rigid = loop.arm.inverse(q, v, a)
+    tau = rigid + _beside_bodies(loop, motion, state, rigid, outside)
     command = _commanded(loop, motion, tau) + reference.tau
     rates, arriving = [], dataclasses.replace(motion, tau=command)
     for effect, own in zip(loop.effects, state.effects, strict=True):
@@ -319,24 +319,24 @@ def _commanded(
     return tau + (tau - now) / gain
 
 
-def _beside_inertia(
+def _beside_bodies(
     loop: ClosedLoop,
     motion: Motion,
     state: State,
     rigid: Float[Array, " joints"],
     outside: Outside,
 ) -> Float[Array, " joints"]:
-    """What a motion takes beside `rigid`, on the arm's inertia, less what comes from outside."""
-    bias = loop.arm.bias(motion.q, motion.v) - outside.push - outside.pull
+    """What a motion takes beside `rigid`, on the arm's bodies, less what comes from outside."""
+    helped = outside.push + outside.pull
     if any(effect.loaded for effect in loop.effects):
         # What depends on the load is given the torque that the motion takes without it.
         pairs = zip(loop.effects, state.effects, strict=True)
         kept = [(e, s) for e, s in pairs if not e.loaded]
         others = loop.with_effects([e for e, _ in kept])
         drive, link = effect_loads(others, motion, tuple(s for _, s in kept))
-        motion = dataclasses.replace(motion, tau=rigid + bias + drive + link)
+        motion = dataclasses.replace(motion, tau=rigid - helped + drive + link)
     drive, link = effect_loads(loop, motion, state.effects, push=outside.push)
-    return bias + drive + link
+    return drive + link - helped
 
 
 def _accelerations(

@@ -1,0 +1,133 @@
+"""A chain of joints in space: where its frames are, and what its bodies' motion takes."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..parameters import as_float64
+
+# What a body's ten parameters are called (Khalil, Dombre 2002), without the link's number: inertia
+# about the origin of the link's frame, first moment, mass.
+BODY = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
+
+
+class Chain(eqx.Module):
+    """Joints one after the other, each with a link that moves with it.
+
+    - `rotations`, `offsets`: from the frame of the link before to that of the joint at zero, m.
+    - `axes`: unit vectors in the joint's frame, along which it slides or about which it turns.
+    - `gravity`: in the base's frame, m/s².
+    - `slides`: whether a joint slides.
+    """
+
+    rotations: Float[Array, "joints 3 3"] = eqx.field(converter=as_float64)
+    offsets: Float[Array, "joints 3"] = eqx.field(converter=as_float64)
+    axes: Float[Array, "joints 3"] = eqx.field(converter=as_float64)
+    gravity: Float[Array, "3"] = eqx.field(converter=as_float64)
+    slides: tuple[bool, ...] = eqx.field(static=True)
+
+    @property
+    def joints(self) -> int:
+        """How many."""
+        return len(self.slides)
+
+    def frames(
+        self, q: Float[Array, " joints"]
+    ) -> tuple[Float[Array, "joints 3 3"], Float[Array, "joints 3"], Float[Array, "joints 3"]]:
+        """Rotation and origin of each link, and its joint's axis, in the base's frame."""
+        turn, place = jnp.eye(3), jnp.zeros(3)
+        turns, places, axes = [], [], []
+        for k, slides in enumerate(self.slides):
+            place = place + turn @ self.offsets[k]
+            turn = turn @ self.rotations[k]
+            axis = turn @ self.axes[k]
+            if slides:
+                place = place + axis * q[k]
+            else:
+                cross = _cross_matrix(self.axes[k])
+                turn = turn @ (
+                    jnp.eye(3) + jnp.sin(q[k]) * cross + (1 - jnp.cos(q[k])) * cross @ cross
+                )
+            turns.append(turn)
+            places.append(place)
+            axes.append(axis)
+        return jnp.stack(turns), jnp.stack(places), jnp.stack(axes)
+
+    def inverse(
+        self,
+        bodies: Float[Array, "joints 10"],
+        q: Float[Array, " joints"],
+        v: Float[Array, " joints"],
+        a: Float[Array, " joints"],
+    ) -> Float[Array, " joints"]:
+        """Torque that a motion takes, `(joints,)`, N·m or N, by Newton's and Euler's equations.
+
+        Forces and moments of the links beyond a joint are summed in the base's frame.
+
+        **Arguments:**
+
+        - `bodies`: `BODY` of each link in its own frame, SI units.
+        - `q`, `v`, `a`: position, velocity, acceleration, rad or m and per s.
+        """
+        turns, places, axes = self.frames(q)
+        slides = jnp.asarray(self.slides)[:, None]
+        turning, sliding = jnp.where(slides, 0.0, axes), jnp.where(slides, axes, 0.0)
+        rate = jnp.cumsum(turning * v[:, None], axis=0)
+        before = jnp.concatenate([jnp.zeros((1, 3)), rate[:-1]])
+        spin = jnp.cumsum(turning * a[:, None] + jnp.cross(before, turning * v[:, None]), axis=0)
+        before_spin = jnp.concatenate([jnp.zeros((1, 3)), spin[:-1]])
+        arm = jnp.diff(places, axis=0, prepend=jnp.zeros((1, 3)))
+        moved = jnp.cross(before_spin, arm) + jnp.cross(before, jnp.cross(before, arm))
+        along = sliding * a[:, None] + 2 * jnp.cross(before, sliding * v[:, None])
+        lift = jnp.cumsum(moved + along, axis=0) - self.gravity
+        inertia, moment, mass = _in_base(bodies, turns)
+        force = mass * lift + jnp.cross(spin, moment) + jnp.cross(rate, jnp.cross(rate, moment))
+        momentum = jnp.einsum("kij,kj->ki", inertia, rate)
+        torque = (
+            jnp.einsum("kij,kj->ki", inertia, spin)
+            + jnp.cross(rate, momentum)
+            + jnp.cross(moment, lift)
+            + jnp.cross(places, force)
+        )
+        beyond = jnp.cumsum(force[::-1], axis=0)[::-1]
+        about_base = jnp.cumsum(torque[::-1], axis=0)[::-1]
+        at_joint = about_base - jnp.cross(places, beyond)
+        return jnp.sum(turning * at_joint + sliding * beyond, axis=1)
+
+    def mass_matrix(
+        self, bodies: Float[Array, "joints 10"], q: Float[Array, " joints"]
+    ) -> Float[Array, "joints joints"]:
+        """Inertia at q, `(joints, joints)`, by composite bodies about the base's origin."""
+        turns, places, axes = self.frames(q)
+        slides = jnp.asarray(self.slides)[:, None]
+        turning = jnp.where(slides, 0.0, axes)
+        passing = jnp.where(slides, axes, jnp.cross(places, axes))
+        inertia, moment, mass = _in_base(bodies, turns)
+        shift = 2 * jnp.einsum("ki,ki->k", places, moment)[:, None, None] * jnp.eye(3)
+        both = jnp.einsum("ki,kj->kij", places, moment)
+        square = jnp.einsum("ki,ki->k", places, places)[:, None, None] * jnp.eye(3)
+        own = square - jnp.einsum("ki,kj->kij", places, places)
+        inertia = inertia + shift - both - both.mT + mass[:, :, None] * own
+        moment = moment + mass * places
+        inertia, moment, mass = (
+            jnp.cumsum(x[::-1], axis=0)[::-1] for x in (inertia, moment, mass)
+        )
+        linear = mass * passing + jnp.cross(turning, moment)
+        angular = jnp.einsum("kij,kj->ki", inertia, turning) + jnp.cross(moment, passing)
+        upper = jnp.triu(turning @ angular.T + passing @ linear.T)
+        return upper + jnp.triu(upper, 1).T
+
+
+def _cross_matrix(x: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    return jnp.cross(jnp.eye(3), x)
+
+
+def _in_base(
+    bodies: Float[Array, "joints 10"], turns: Float[Array, "joints 3 3"]
+) -> tuple[Float[Array, "joints 3 3"], Float[Array, "joints 3"], Float[Array, "joints 1"]]:
+    """Inertia about the link's origin, first moment and mass of each link, along the base's axes."""
+    xx, xy, xz, yy, yz, zz = (bodies[:, k] for k in range(6))
+    rows = [jnp.stack(row, axis=-1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
+    own = jnp.stack(rows, axis=-2)
+    inertia = jnp.einsum("kij,kjl,kml->kim", turns, own, turns)
+    return inertia, jnp.einsum("kij,kj->ki", turns, bodies[:, 6:9]), bodies[:, 9:]

@@ -1,0 +1,268 @@
+"""A serial arm in space, of as many joints as it has, by the base parameters of its bodies."""
+
+import os
+from functools import lru_cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..errors import ModelError
+from ..parameters import KNOWN, Vector, as_float64, parameter
+from ._base import AbstractArm
+from .chain import BODY, Chain
+from .urdf import Described, read_urdf
+
+
+class SerialArm(AbstractArm):
+    """A chain of turning and sliding joints, linear in its base parameters.
+
+    Of the ten parameters of each link a motion shows combinations alone (Gautier, Khalil 1990).
+    `base` holds these, each led by the parameter that it is named after; the other parameters stay
+    at the values of `bodies`. `SerialArm.from_urdf` makes one of a URDF file.
+
+    **Arguments:**
+
+    - `chain`: its joints. `bodies`: `BODY` of each link as drawn, SI units, `(joints, 10)`.
+    - `lower`, `upper`: limits of the joints, `(joints,)`, rad or m.
+    - `gears`: turns of each motor for those of each joint, `(joints, joints)`, where motors drive
+      more than their own joint; None where each has its own.
+    - `base`: values of the base parameters; those of `bodies` by default.
+    """
+
+    chain: Chain = eqx.field(metadata=KNOWN)
+    bodies: Float[Array, "joints 10"] = eqx.field(converter=as_float64)
+    lower: tuple[float, ...] = eqx.field(static=True)
+    upper: tuple[float, ...] = eqx.field(static=True)
+    gears: tuple[tuple[float, ...], ...] | None = eqx.field(static=True, default=None)
+    base: Vector = parameter(None, symbol="base", unit="SI", scale=1.0)
+    leading: tuple[int, ...] = eqx.field(static=True, default=())
+    base_names: tuple[str, ...] = eqx.field(static=True, default=())
+    combined: Float[Array, "base parameters"] = eqx.field(converter=as_float64, default=None)
+
+    def __post_init__(self):
+        if not self.leading:
+            found = base_parameters(self.chain, self.lower, self.upper)
+            self.leading, self.base_names, self.combined = found
+        if self.base is None:
+            self.base = jnp.asarray(self.combined) @ jnp.ravel(jnp.asarray(self.bodies))
+
+    @classmethod
+    def from_urdf(
+        cls,
+        source: str | os.PathLike[str],
+        *,
+        base: str | None = None,
+        tip: str | None = None,
+        gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
+        gears: tuple[tuple[float, ...], ...] | None = None,
+    ) -> "SerialArm":
+        """The arm that a URDF describes, from one of its links to another.
+
+        **Arguments:**
+
+        - `source`: path of the file, or its text.
+        - `base`, `tip`: names of the first and last link; where None, the root, and the only leaf.
+        - `gravity`: in the frame of the first link, m/s².
+        - `gears`: as above.
+
+        **Raises:** `ModelError` for a file that cannot be read or describes no such chain.
+        """
+        return cls.of(read_urdf(source, base, tip), gravity, gears)
+
+    @classmethod
+    def of(
+        cls,
+        found: Described,
+        gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
+        gears: tuple[tuple[float, ...], ...] | None = None,
+    ) -> "SerialArm":
+        """The arm of a description that was read."""
+        if gears is not None and np.shape(gears) != (len(found.joints),) * 2:
+            raise ModelError(
+                f"gears have shape {np.shape(gears)}, but the arm has {len(found.joints)} joints: "
+                "give a square matrix, a row for each motor and a column for each joint"
+            )
+        rotations, offsets, axes = (
+            np.stack([getattr(joint, what) for joint in found.joints])
+            for what in ("rotation", "offset", "axis")
+        )
+        slides = tuple(joint.slides for joint in found.joints)
+        chain = Chain(rotations, offsets, axes, gravity, slides)
+        lower = tuple(joint.lower for joint in found.joints)
+        upper = tuple(joint.upper for joint in found.joints)
+        matrix = None if gears is None else tuple(tuple(float(x) for x in row) for row in gears)
+        return cls(chain, found.bodies, lower, upper, matrix)
+
+    @property
+    def joints(self) -> int:
+        """As many as the chain has."""
+        return self.chain.joints
+
+    def prismatic(self) -> tuple[bool, ...]:
+        """As the chain has them."""
+        return self.chain.slides
+
+    def inertias(self) -> Float[Array, "joints 10"]:
+        """`BODY` of each link with these base parameters, SI units.
+
+        Torque is right with them; what no motion shows of them is as in `bodies`.
+        """
+        drawn = jnp.ravel(self.bodies)
+        changed = self.base - self.combined @ drawn
+        return drawn.at[jnp.asarray(self.leading)].add(changed).reshape(self.bodies.shape)
+
+    def combinations(self) -> dict[str, str]:
+        """What each base parameter is the sum of."""
+        names = [f"{what}{k}" for k in range(1, self.joints + 1) for what in BODY]
+        rows = np.asarray(self.combined)
+        found = {}
+        for name, row in zip(self.base_names, rows, strict=True):
+            terms = [(names[k], row[k]) for k in np.flatnonzero(np.abs(row) > 1e-6)]
+            terms.sort(key=lambda term: term[0] != name.removesuffix("R"))
+            text = " ".join(
+                f"{'-' if c < 0 else '+'} {'' if abs(abs(c) - 1) < 1e-9 else f'{abs(c):.4g} '}{t}"
+                for t, c in terms
+            )
+            found[name] = text.removeprefix("+ ")
+        return found
+
+    def mass_matrix(self, q: Float[Array, " joints"]) -> Float[Array, "joints joints"]:
+        """Inertia at q, `(joints, joints)`, kg·m² or kg."""
+        return self.chain.mass_matrix(self.inertias(), q)
+
+    def bias(
+        self, q: Float[Array, " joints"], v: Float[Array, " joints"]
+    ) -> Float[Array, " joints"]:
+        """Coriolis, centrifugal and gravity torque, `(joints,)`, N·m or N."""
+        return self.inverse(q, v, jnp.zeros_like(q))
+
+    def inverse(
+        self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
+    ) -> Float[Array, " joints"]:
+        """Torque that a motion takes, `(joints,)`, N·m or N, without the inertia matrix."""
+        return self.chain.inverse(self.inertias(), q, v, a)
+
+    def hold_rotor(self) -> tuple[bool, ...]:
+        """Of which joints the rotor's inertia is a part of base parameters, `(joints,)`."""
+        rows, _, a = _regressor(self.chain, self.lower, self.upper)
+        basis = np.linalg.qr(rows[:, np.asarray(self.leading)])[0]
+        found = []
+        for j in range(self.joints):
+            column = np.zeros((len(a), self.joints))
+            column[:, j] = a[:, j]
+            flat = column.ravel() / np.linalg.norm(column)
+            found.append(bool(np.linalg.norm(flat - basis @ (basis.T @ flat)) < 1e-7))
+        return tuple(found)
+
+    def planar(self) -> bool:
+        """It moves in space."""
+        return False
+
+    def couplings(self) -> tuple[tuple[int, int, float], ...]:
+        """As the gears have them; where none are declared, neighbours that turn, either way."""
+        if self.gears is None:
+            turning = [not slides for slides in self.chain.slides]
+            pairs = [j for j in range(1, self.joints) if turning[j - 1] and turning[j]]
+            return tuple((j, j + 1, sign) for j in pairs for sign in (1.0, -1.0))
+        return tuple(
+            (joint, motor, turns / row[motor - 1])
+            for motor, row in enumerate(self.gears, start=1)
+            for joint, turns in enumerate(row, start=1)
+            if joint != motor and turns != 0 and row[motor - 1] != 0
+        )
+
+    def gravity(self) -> float:
+        """Its size, m/s²."""
+        return float(np.linalg.norm(np.asarray(self.chain.gravity)))
+
+    def workspace(self) -> Float[np.ndarray, "points joints"]:
+        """Positions drawn between the limits, `(points, joints)`."""
+        low, high = np.asarray(self.lower), np.asarray(self.upper)
+        return np.random.default_rng(0).uniform(low, high, (8 * self.joints, self.joints))
+
+    def smallest_inertia(self) -> Float[Array, ""]:
+        """Smallest eigenvalue of the mass matrix over the workspace; above zero when physical.
+
+        Bodies that are drawn as points leave it singular up to rounding, and rotors are not in it.
+        """
+        masses = jax.vmap(self.mass_matrix)(jnp.asarray(self.workspace()))
+        found = jnp.linalg.eigvalsh(masses)
+        return jnp.min(found) + 1e-9 * jnp.max(found)
+
+
+def base_parameters(
+    chain: Chain, lower: tuple[float, ...], upper: tuple[float, ...]
+) -> tuple[tuple[int, ...], tuple[str, ...], Float[np.ndarray, "base parameters"]]:
+    """Which combinations of the bodies' parameters torque depends on (Gautier 1991).
+
+    **Arguments:**
+
+    - `lower`, `upper`: limits of the joints, rad or m.
+
+    **Returns:** the place of the parameter that leads each combination, its name (with an R where
+    others are added to it), and the combinations, `(base, 10 · joints)`.
+    """
+    geometry = tuple(
+        tuple(np.asarray(x).ravel().tolist())
+        for x in (chain.rotations, chain.offsets, chain.axes, chain.gravity)
+    )
+    return _base_parameters(geometry, chain.slides, lower, upper)
+
+
+@lru_cache(maxsize=64)
+def _base_parameters(geometry, slides, lower, upper):
+    import scipy
+
+    n = len(slides)
+    shapes = (n, 3, 3), (n, 3), (n, 3), (3,)
+    chain = Chain(*(np.reshape(x, s) for x, s in zip(geometry, shapes, strict=True)), slides)
+    rows, *_ = _regressor(chain, lower, upper)
+    size = np.linalg.norm(rows, axis=0)
+    size = np.where(size > 1e-9 * size.max(), size, 0.0)
+    kept: list[int] = []
+    basis = np.zeros((len(rows), 0))
+    for k in sorted(np.flatnonzero(size > 0), key=lambda k: _led(int(k), chain)):
+        column = rows[:, k] / size[k]
+        for _ in range(2):
+            column = column - basis @ (basis.T @ column)
+        left = np.linalg.norm(column)
+        if left > 1e-7:
+            basis = np.column_stack([basis, column / left])
+            kept.append(int(k))
+    kept.sort()
+    combined = scipy.linalg.lstsq(rows[:, kept], rows)[0]
+    combined[np.abs(combined) < 1e-9] = 0.0
+    names = []
+    for row, k in zip(combined, kept, strict=True):
+        several = np.count_nonzero(np.abs(row) > 1e-6) > 1
+        names.append(f"{BODY[k % 10]}{k // 10 + 1}{'R' if several else ''}")
+    return tuple(kept), tuple(names), combined
+
+
+def _led(place: int, chain: Chain) -> tuple[bool, int]:
+    """Where a parameter stands among those that may lead a combination.
+
+    Mass, first moment along the axis and one moment across it go with the link before (Khalil,
+    Dombre 2002), and lead only where there is none that they could go with.
+    """
+    axis = int(np.argmax(np.abs(np.asarray(chain.axes)[place // 10])))
+    across = (axis + 2) % 3
+    led = (("XX", "YY", "ZZ")[across], ("MX", "MY", "MZ")[axis], "M")
+    return BODY[place % 10] in led, place
+
+
+def _regressor(
+    chain: Chain, lower: tuple[float, ...], upper: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Torque by all bodies' parameters at drawn states, one row a joint; speeds; accelerations."""
+    n = chain.joints
+    rng = np.random.default_rng(0)
+    q = rng.uniform(lower, upper, (20 * n, n))
+    v, a = rng.normal(size=(2, 20 * n, n))
+    # Torque is linear in the bodies, so that their derivative is the same everywhere.
+    by_bodies = jax.vmap(jax.jacfwd(lambda bodies, *at: chain.inverse(bodies, *at)), (None, 0, 0, 0))
+    rows = jax.jit(by_bodies)(jnp.zeros((n, 10)), q, v, a)
+    return np.asarray(rows).reshape(-1, 10 * n), v, a

@@ -1,0 +1,52 @@
+"""What two joints share: a shaft of the drive that turns with both."""
+
+from collections.abc import Iterable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..parameters import Scalar, as_float64, parameter
+from ._base import AbstractEffect, Motion, smooth_sign
+from ._scene import Scene
+from .friction import sharpness
+
+
+class SharedShaft(AbstractEffect):
+    """Friction and inertia of a shaft that turns with a joint and with the next one it drives.
+
+    The motor of a wrist's last joint often reaches it through the joint before, and turns with
+    w = share v_i + v_j. Its friction Fv w + Fc sigma(w) and inertia I w' load both joints
+    (Gautier, Janot 2012, on the Stäubli TX40).
+
+    **Arguments:**
+
+    - `joint`: the one that the shaft passes, i. `driven`: the one that it drives, j.
+    - `share`: turns of the shaft for one of joint i, in turns for one of joint j.
+    """
+
+    joint_fields = ("joint", "driven")
+    joint: int = eqx.field(static=True)
+    driven: int = eqx.field(static=True)
+    viscous: Scalar = parameter(0.0, symbol="Fvs", unit="N·m·s/rad", lower=0.0, scale=0.05)
+    coulomb: Scalar = parameter(0.0, symbol="Fcs", unit="N·m", lower=0.0, scale=0.1)
+    inertia: Scalar = parameter(0.0, symbol="Ias", unit="kg·m²", lower=0.0, scale=0.01)
+    share: Scalar = eqx.field(converter=as_float64, default=1.0)
+    gamma: Scalar = sharpness()
+    inertial = True
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["SharedShaft"]:
+        """The pairs that gears couple, or may couple."""
+        return [
+            cls(joint=i, driven=j, share=share, gamma=scene.sharpness(j))
+            for i, j, share in scene.couplings
+        ]
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """What the shaft asks of both joints, `(joints,)`."""
+        way = jnp.zeros_like(motion.v).at[self.joint - 1].set(self.share)
+        way = way.at[self.driven - 1].add(1.0)
+        speed, rate = way @ motion.v, way @ motion.a
+        friction = self.viscous * speed + self.coulomb * smooth_sign(speed, self.gamma)
+        return way * (friction + self.inertia * rate)
