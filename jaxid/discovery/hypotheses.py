@@ -75,6 +75,8 @@ def survey(
     low, high = q.min(axis=0), q.max(axis=0)
     speed = np.abs(np.asarray(motion.v)).reshape(-1, loop.joints).max(axis=0)
     mass = np.asarray(jax.vmap(loop.arm.mass_matrix)(jnp.asarray(q[:: max(1, len(q) // 64)])))
+    # Rotors are effects: without them drawn bodies may leave a wrist next to none.
+    mass = mass + 1e-6 * np.trace(mass, axis1=1, axis2=2)[:, None, None] * np.eye(loop.joints)
     sharp = {e.joint: float(e.gamma) for e in loop.effects if isinstance(e, Coulomb)}
     return Scene(
         low,

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..estimate import Fit
-from ..noise import ARFilter, fit_ar
+from ..noise import ARFilter
 from .score import Data
+from .separate import filter_of
 
 # Largest order of a model's noise filters.
 _HIGHEST = 30
@@ -56,7 +57,7 @@ def _scored(series: Sequence[Sequence[np.ndarray]], freedom: int, paid: float) -
     total, value, noise = sum(len(s) for rows in series for s in rows), 0.0, []
     for rows in series:
         # A mean is the model's to explain, and not taken off.
-        found = fit_ar(rows, highest=_HIGHEST, criterion="bic")
+        found = filter_of(rows, _HIGHEST)
         size = np.array([len(s) for s in rows])
         # Recordings have noise of levels of their own where that is worth its price.
         power = np.array([np.mean(found.whiten(s)[found.order :] ** 2) for s in rows])

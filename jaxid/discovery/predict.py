@@ -131,7 +131,10 @@ class Predictor(eqx.Module):
         if not free.all():
             open_ = spanned(self.base[:, free])
             absorbed[:, 1:] = open_ @ (open_.T @ within[:, 1:])
+        before = np.linalg.norm(white, axis=0)
         white = white - self.basis @ absorbed
+        # What the base does as well is rounding now, and no direction to go.
+        white[:, 1:] *= np.linalg.norm(white[:, 1:], axis=0) > 1e-7 * before[1:]
         gram = white.T @ white
         loss = gram[0, 0] if there else np.inf
         sums = Sums(

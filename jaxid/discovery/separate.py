@@ -99,9 +99,23 @@ def noise_of(data: Data, rows: Rows, lost: float, highest: int = 30) -> tuple[AR
     filters = []
     for j in range(outputs):
         series = [s - s.mean() for s in data.series(rows, j)]
-        found = fit_ar(series, highest=highest, criterion="bic")
+        found = filter_of(series, highest)
         filters.append(ARFilter(found.coefficients, max(found.variance * share, 1e-300)))
     return tuple(filters)
+
+
+def filter_of(series: Sequence[Float[np.ndarray, " _"]], highest: int) -> ARFilter:
+    """The AR filter of one output's residuals, whose memory is short beside the recordings.
+
+    What changes as slowly as the recordings themselves cannot be told from what a model lacks: a
+    filter that is free to call it noise makes up for a spring.
+    """
+    found = fit_ar(series, highest=highest, criterion="bic")
+    return found.forgetting(max(len(x) for x in series) / _MEMORIES, series)
+
+
+# How often in a recording noise forgets what it was, at the least.
+_MEMORIES = 10
 
 
 def levelled(

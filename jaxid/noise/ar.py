@@ -115,6 +115,25 @@ class ARFilter(eqx.Module):
         noise = scipy.signal.lfilter([np.sqrt(filt.variance)], filt.polynomial, white, axis=-1)
         return np.asarray(noise)[..., lead:]
 
+    def forgetting(
+        self, samples: float, series: Sequence[Float[np.ndarray, " _"]]
+    ) -> "ARFilter":
+        """The filter with no pole whose memory is longer than that, its variance that of series.
+
+        **Arguments:**
+
+        - `samples`: after which what a pole remembers has sunk to 1/e.
+        - `series`: what the filter was estimated from.
+        """
+        poles = np.roots(self.polynomial)
+        longest = np.exp(-1 / max(samples, 1e-3))
+        if not np.any(np.abs(poles) > longest):
+            return self
+        inside = poles * np.minimum(1.0, longest / np.maximum(np.abs(poles), 1e-12))
+        changed = ARFilter(np.real(np.poly(inside))[1:], self.variance)
+        left = np.concatenate([changed.whiten(x)[self.order :] for x in series])
+        return ARFilter(changed.coefficients, float(np.mean(left**2)))
+
     def taps(self, size: int) -> Float[np.ndarray, " size"]:
         """The polynomial padded with zeros."""
         return np.pad(self.polynomial, (0, size - self.order - 1))

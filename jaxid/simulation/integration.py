@@ -126,6 +126,8 @@ def _rate(loop: ClosedLoop, intervals: Interval, x: Float[Array, " states"]) -> 
         derivative = instant_at(loop, interval, t, unravel(jnp.stack(y))).derivative
         return tuple(ravel_pytree(derivative)[0])
 
+    if imposed(loop):
+        return rate
     first = one_of(intervals, jnp.asarray(0))
     return unrolled(rate, first, first.t0, tuple(x))
 
