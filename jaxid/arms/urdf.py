@@ -70,6 +70,7 @@ def read_urdf(
                 f"{where} hangs link {child!r} on two joints: a serial arm's links have one each"
             )
         parents[child] = (parent, joint)
+    _check_circles(parents, where)
     base = _base(base, links, parents, where)
     tip = _tip(tip, base, links, parents, where)
     path = _path(base, tip, parents, where)
@@ -129,11 +130,21 @@ def _end(joint: Any, what: str, links: dict[str, Any], where: str) -> str:
     return name
 
 
+def _check_circles(parents: dict, where: str) -> None:
+    for link in parents:
+        at, seen = link, set()
+        while at in parents:
+            if at in seen:
+                raise ModelError(
+                    f"{where} has joints in a circle through link {at!r}: a serial arm has a base"
+                )
+            seen.add(at)
+            at = parents[at][0]
+
+
 def _base(base: str | None, links: dict, parents: dict, where: str) -> str:
     roots = [name for name in links if name not in parents]
     if base is None:
-        if not roots:
-            raise ModelError(f"{where} has joints in a circle: a serial arm has a base")
         if len(roots) > 1:
             raise ModelError(f"{where} has several roots, {', '.join(roots)}: give base=")
         return roots[0]
@@ -151,16 +162,14 @@ def _tip(tip: str | None, base: str, links: dict, parents: dict, where: str) -> 
     ends: dict[str, str] = {}
     carrying = {parent for parent, _ in parents.values()}
     for leaf in (name for name in links if name not in carrying):
-        last, seen = leaf, set()
-        while last in parents and parents[last][1].get("type") == "fixed" and last not in seen:
-            seen.add(last)
+        last = leaf
+        while last in parents and parents[last][1].get("type") == "fixed":
             last = parents[last][0]
         ends.setdefault(last, leaf)
     inner = set()
     for end in ends:
-        at, seen = end, set()
-        while at in parents and at not in seen:
-            seen.add(at)
+        at = end
+        while at in parents:
             at = parents[at][0]
             inner.add(at)
     outer = [end for end in ends if end not in inner]
@@ -172,12 +181,12 @@ def _tip(tip: str | None, base: str, links: dict, parents: dict, where: str) -> 
 
 def _path(base: str, tip: str, parents: dict, where: str) -> list[tuple[str, Any]]:
     """Links from the base to the tip, each with the joint that carries it."""
-    path, at, seen = [], tip, set()
+    path, at = [], tip
     while at != base:
-        if at in seen or at not in parents:
-            reason = "joints in a circle" if at in seen else "no chain of joints"
-            raise ModelError(f"{where} has {reason} from {base!r} to {tip!r}: name other links")
-        seen.add(at)
+        if at not in parents:
+            raise ModelError(
+                f"{where} has no chain of joints from {base!r} to {tip!r}: name other links"
+            )
         path.append((at, parents[at][1]))
         at = parents[at][0]
     return path[::-1]
@@ -271,9 +280,8 @@ def _bodies(
     """The bodies of the chain's links, with all that hangs on them."""
     found = np.zeros((count, 10))
     for link, element in links.items():
-        frame, at, seen = (np.eye(3), np.zeros(3)), link, set()
-        while at not in owner and at != base and at in parents and at not in seen:
-            seen.add(at)
+        frame, at = (np.eye(3), np.zeros(3)), link
+        while at not in owner and at != base and at in parents:
             parent, joint = parents[at]
             turn, place = _origin(joint, f"joint {_name(joint, where)!r} in {where}")
             frame = turn @ frame[0], place + turn @ frame[1]

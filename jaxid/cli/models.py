@@ -15,8 +15,8 @@ def load_robot(robot: str) -> Any:
 
     **Arguments:**
 
-    - `robot`: `scara`, `two-link`, `emps`, or `path/to/file.py:name` of a loop, or of a function
-      without arguments that gives one.
+    - `robot`: `scara`, `two-link`, `emps`, a URDF file, or `path/to/file.py:name` of a loop, or of a
+      function without arguments that gives one.
 
     **Raises:** `ModelError` that says what was not found.
     """
@@ -26,10 +26,13 @@ def load_robot(robot: str) -> Any:
     ready = {"scara": robots.scara, "two-link": robots.two_link, "emps": robots.emps}
     if robot in ready:
         return ready[robot]()
+    if robot.lower().endswith(".urdf"):
+        return robots.serial(robot)
     path, _, name = robot.rpartition(":")
     if not path.endswith(".py"):
         raise ModelError(
-            f"there is no robot {robot!r}: choose {', '.join(ready)}, or give FILE.py:NAME"
+            f"there is no robot {robot!r}: choose {', '.join(ready)}, or give FILE.urdf or "
+            "FILE.py:NAME"
         )
     made = getattr(_module(path), name, None)
     try:

@@ -91,8 +91,10 @@ class Placed(eqx.Module):
 
     def motion(self, motion: Motion) -> Motion:
         """A motion with the effect's joints first."""
-        moved = {name: getattr(motion, name)[..., self.order] for name in ("q", "v", "a", "tau")}
-        return dataclasses.replace(motion, **moved)
+        def rows(m: Motion) -> tuple[Array, ...]:
+            return m.q, m.v, m.a, m.tau
+
+        return eqx.tree_at(rows, motion, tuple(x[..., self.order] for x in rows(motion)))
 
     def back(self, forces: Any) -> Any:
         """What was found of the joints in that order, `(points, joints, ...)`, in the arm's."""

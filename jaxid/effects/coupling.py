@@ -27,7 +27,7 @@ class SharedShaft(AbstractEffect):
 
     joint_fields = ("joint", "driven")
     joint: int = eqx.field(static=True)
-    driven: int = eqx.field(static=True)
+    driven: int = eqx.field(static=True, default=2)
     viscous: Scalar = parameter(0.0, symbol="Fvs", unit="N·m·s/rad", lower=0.0, scale=0.05)
     coulomb: Scalar = parameter(0.0, symbol="Fcs", unit="N·m", lower=0.0, scale=0.1)
     inertia: Scalar = parameter(0.0, symbol="Ias", unit="kg·m²", lower=0.0, scale=0.01)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...compiling import compiled
 from ...simulation.batch import Batch
+from ...simulation.dynamics import imposed
 from ...simulation.loop import ClosedLoop
 from ...simulation.sharing import (
     shared_out,
@@ -210,7 +211,10 @@ class Problem(eqx.Module):
         # By the squares: a loop close to running away has derivatives that are finite and useless.
         sound = jnp.isfinite(jnp.sum(sums.gram)) & jnp.isfinite(jnp.sum(sums.start_gram))
         loss = jnp.sum(sums.loss)
-        sound = sound & jnp.isfinite(loss) & (loop.arm.smallest_inertia() > 0)
+        sound = sound & jnp.isfinite(loss)
+        if not imposed(loop):
+            # A motion that is given takes a torque of any inertia; to move, an arm needs mass.
+            sound = sound & (loop.arm.smallest_inertia() > 0)
         return Point(theta, start, found, sums, jnp.where(sound, loss, jnp.inf))
 
 
