@@ -13,17 +13,21 @@ from plotly.subplots import make_subplots
 import jaxid
 from jaxid.discovery.diagnosis import Verdict, coordinate_unit
 from jaxid.display import figures
-from jaxid.effects import Curve
+from jaxid.effects import Counterbalance, Curve, SharedShaft
 
 OUT = Path(__file__).parent / "img" / "effects"
 DEMO = Path(jaxid.__file__).parent / "demo" / "clean"
 COORDINATES = ("q", "v", "a", "tau")
+# Effects that are not proposed for an arm in a plane, as one would show them.
+ELSEWHERE = (Counterbalance(joint=2, angle=-1.0), SharedShaft(joint=1, driven=2))
 
 
 def main() -> None:
     """Writes one picture for each class of the catalogue."""
     recordings = jaxid.read(DEMO / "fit_1.csv", DEMO / "fit_2.csv")
-    diagnosis = jaxid.diagnose(jaxid.fit(jaxid.scara(), recordings), progress=False)
+    catalogue = (*jaxid.catalogue, *ELSEWHERE)
+    fit = jaxid.fit(jaxid.scara(), recordings)
+    diagnosis = jaxid.diagnose(fit, catalogue=catalogue, progress=False)
     OUT.mkdir(parents=True, exist_ok=True)
     for effect in jaxid.catalogue:
         forms = [v for v in diagnosis.forms if type(v.hypothesis.effect) is effect]

@@ -157,7 +157,7 @@ BROKEN = {
     "<robot": "is not XML",
     "<mujoco/>": "has <mujoco> at its top",
     POLAR.replace('type="continuous"', 'type="floating"'): "is 'floating'",
-    POLAR.replace("<mass value=\"3\"/>", ""): "without its mass or inertia",
+    POLAR.replace('<mass value="3"/>', ""): "without its mass or inertia",
     POLAR.replace('mass value="3"', 'mass value="nan"'): "the mass of link 'slide'",
     POLAR.replace('mass value="3"', 'mass value="-3"'): "an inertia that no body has",
     POLAR.replace('izz="0.1"', 'izz="5"'): "an inertia that no body has",

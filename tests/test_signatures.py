@@ -106,7 +106,9 @@ def test_finite_effects_that_share_a_program_are_as_in_simulations_of_their_own(
     for effect, change in zip(effects, found, strict=True):
         alone = jaxid.simulate(loop.add(effect), record)[0].tau
         # Contact is stiff: what rounding does to its first touch grows.
-        np.testing.assert_allclose(plain + change[0], alone, atol=1e-6 * largest.max(), err_msg=str(effect))
+        np.testing.assert_allclose(
+            plain + change[0], alone, atol=1e-6 * largest.max(), err_msg=str(effect)
+        )
 
 
 class Creep(AbstractEffect):

@@ -109,9 +109,7 @@ class Chain(eqx.Module):
         own = square - jnp.einsum("ki,kj->kij", places, places)
         inertia = inertia + shift - both - both.mT + mass[:, :, None] * own
         moment = moment + mass * places
-        inertia, moment, mass = (
-            jnp.cumsum(x[::-1], axis=0)[::-1] for x in (inertia, moment, mass)
-        )
+        inertia, moment, mass = (jnp.cumsum(x[::-1], axis=0)[::-1] for x in (inertia, moment, mass))
         linear = mass * passing + jnp.cross(turning, moment)
         angular = jnp.einsum("kij,kj->ki", inertia, turning) + jnp.cross(moment, passing)
         upper = jnp.triu(turning @ angular.T + passing @ linear.T)

@@ -263,6 +263,8 @@ def _regressor(
     q = rng.uniform(lower, upper, (20 * n, n))
     v, a = rng.normal(size=(2, 20 * n, n))
     # Torque is linear in the bodies, so that their derivative is the same everywhere.
-    by_bodies = jax.vmap(jax.jacfwd(lambda bodies, *at: chain.inverse(bodies, *at)), (None, 0, 0, 0))
+    by_bodies = jax.vmap(
+        jax.jacfwd(lambda bodies, *at: chain.inverse(bodies, *at)), (None, 0, 0, 0)
+    )
     rows = jax.jit(by_bodies)(jnp.zeros((n, 10)), q, v, a)
     return np.asarray(rows).reshape(-1, 10 * n), v, a

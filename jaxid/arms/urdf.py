@@ -239,9 +239,7 @@ def _moving(
         if not low < high:
             raise ModelError(f"{said} has limits {low:g} and {high:g}: the lower comes first")
     turn, place = frame
-    return DescribedJoint(
-        name, link, turn, place, axis / length, kind == "prismatic", low, high
-    )
+    return DescribedJoint(name, link, turn, place, axis / length, kind == "prismatic", low, high)
 
 
 def _origin(element: Any, said: str) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,8 @@ Files = Annotated[
     typer.Argument(help="Recordings: .csv, .tsv, .txt, .parquet, .mat or .npz, also .gz."),
 ]
 Robot = Annotated[
-    str, typer.Option(help="scara, two-link, emps, or FILE.py:NAME for a loop of your own.")
+    str,
+    typer.Option(help="scara, two-link, emps, FILE.urdf, or FILE.py:NAME for a loop of your own."),
 ]
 Json = Annotated[Path | None, typer.Option("--json", help="Also write the result here.")]
 Column = Annotated[

@@ -91,7 +91,8 @@ class Placed(eqx.Module):
 
     def motion(self, motion: Motion) -> Motion:
         """A motion with the effect's joints first."""
-        def rows(m: Motion) -> tuple[Array, ...]:
+
+        def rows(m):
             return m.q, m.v, m.a, m.tau
 
         return eqx.tree_at(rows, motion, tuple(x[..., self.order] for x in rows(motion)))

@@ -55,7 +55,12 @@ class Payload(AbstractEffect):
         """
         slides = all(scene.slides)
         known = slides or len(scene.lengths) == len(scene.slides) - 1
-        if len(scene.recordings) < 2 or not scene.planar or not known or any(scene.slides) != slides:
+        if (
+            len(scene.recordings) < 2
+            or not scene.planar
+            or not known
+            or any(scene.slides) != slides
+        ):
             return []
         reaches = (0.0,) if slides else (0.1, 0.2, 0.35, 0.5)
         return [

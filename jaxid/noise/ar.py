@@ -115,9 +115,7 @@ class ARFilter(eqx.Module):
         noise = scipy.signal.lfilter([np.sqrt(filt.variance)], filt.polynomial, white, axis=-1)
         return np.asarray(noise)[..., lead:]
 
-    def forgetting(
-        self, samples: float, series: Sequence[Float[np.ndarray, " _"]]
-    ) -> "ARFilter":
+    def forgetting(self, samples: float, series: Sequence[Float[np.ndarray, " _"]]) -> "ARFilter":
         """The filter with no pole whose memory is longer than that, its variance that of series.
 
         **Arguments:**
