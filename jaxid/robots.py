@@ -1,7 +1,10 @@
 """Ready robots: arm, friction, controller and start values of the papers."""
 
 import os
+from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
 
 from .arms import SCARA, Axis, SerialArm, TwoLink
 from .arms.urdf import read_urdf
@@ -60,7 +63,7 @@ def serial(
     source: str | os.PathLike[str],
     controller: AbstractController | None = None,
     *,
-    rotors: tuple[float, ...] | None = None,
+    rotors: Sequence[float] | np.ndarray | None = None,
     gears: Any = None,
     bodies: str = "drawn",
     base: str | None = None,
@@ -89,12 +92,12 @@ def serial(
     n = arm.joints
     if rotors is not None and len(rotors) != n:
         raise ModelError(f"rotors are given for {len(rotors)} of {n} joints: give one for each")
-    own = rotors or (0.0,) * n
-    # Along a given motion a sharp sign costs nothing, and one that is too soft leaves its own shape.
+    own = np.zeros(n) if rotors is None else np.asarray(rotors, float)
+    # Along a given motion a sharp sign costs nothing; one that is too soft leaves its shape.
     effects = (
         *_friction(n, gamma=1e4),
         *(TorqueOffset(joint=j) for j in range(1, n + 1)),
-        *(RotorInertia(joint=j, inertia=own[j - 1]) for j in range(1, n + 1)),
+        *(RotorInertia(joint=j, inertia=float(own[j - 1])) for j in range(1, n + 1)),
     )
     loop = ClosedLoop(arm, controller or Tracking(), effects, name=found.name)
     held = [p.name for p in loop.parameters if p.declaration.symbol == "base"]

@@ -100,12 +100,27 @@ def test_pictures_named_in_the_readme_are_there_and_small() -> None:
         assert (ROOT / path).stat().st_size < 400_000
 
 
-def test_code_of_bring_your_own_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def three_joints() -> str:
+    """A URDF of three joints in a row."""
+    body = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
+    links = [f'<link name="{name}">{body}</link>' for name in ("upper", "fore", "wrist_3_link")]
+    ends = [("base", "upper"), ("upper", "fore"), ("fore", "wrist_3_link")]
+    joints = [
+        f'<joint name="to_{child}" type="continuous"><origin xyz="0.3 0 0"/><axis xyz="0 1 0"/>'
+        f'<parent link="{parent}"/><child link="{child}"/></joint>'
+        for parent, child in ends
+    ]
+    return f'<robot name="arm"><link name="base"/>{"".join(links + joints)}</robot>'
+
+
+def test_code_of_bring_your_own_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("arm.urdf").write_text(three_joints(), encoding="utf-8")
     asked: list[Any] = []
     monkeypatch.setattr(jaxid, "read", lambda *files, **given: asked.append(given))
     monkeypatch.setattr(jaxid, "discover", lambda *args, **given: asked.append(given))
     text = (DOCS / "your-own.md").read_text(encoding="utf-8")
-    own: dict[str, Any] = {"jaxid": jaxid, "recordings": None}
+    own: dict[str, Any] = {"jaxid": jaxid, "recordings": None, "G": np.eye(3)}
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(block, own)
     assert set(asked[0]["columns"]) == {"time", "q", "tau"}

@@ -137,7 +137,7 @@ def test_simulation_and_inverse_agree_on_the_load():
         jnp.zeros(()),
         state,
         Reference(none, none, none, tau),
-        Outside(none, none, Reading(none, none)),
+        Outside(none, none, Reading(none, none), none),
         jnp.asarray(0),
     )
     motion = Motion(jnp.zeros(()), q, v, now.a, tau, jnp.zeros(0), jnp.asarray(0))

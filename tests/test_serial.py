@@ -43,7 +43,8 @@ POLAR = """<robot name="polar">
  <joint name="turn" type="continuous"><parent link="floor"/><child link="column"/>
   <origin xyz="0 0 0.5" rpy="0 0.3 0"/><axis xyz="0 0 1"/></joint>
  <joint name="reach" type="prismatic"><parent link="column"/><child link="slide"/>
-  <origin xyz="0.1 0 0.2" rpy="0 0 0.2"/><axis xyz="1 0 0"/><limit lower="0" upper="0.6" effort="9" velocity="9"/></joint>
+  <origin xyz="0.1 0 0.2" rpy="0 0 0.2"/><axis xyz="1 0 0"/>
+  <limit lower="0" upper="0.6" effort="9" velocity="9"/></joint>
  <joint name="clamp" type="fixed"><parent link="slide"/><child link="tool"/>
   <origin xyz="0.4 0 0" rpy="0.5 0 0"/></joint>
 </robot>"""

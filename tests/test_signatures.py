@@ -102,7 +102,7 @@ def test_finite_effects_that_share_a_program_are_as_in_simulations_of_their_own(
         JointElasticity(joint=1, compliance=4e-3, rotor=1.0),
     ]
     plain = jaxid.simulate(loop, record)[0].tau
-    found = differences(loop, batch, effects, 0, plain[None])
+    found = differences(loop, batch, effects, 0, jnp.asarray(plain)[None])
     for effect, change in zip(effects, found, strict=True):
         alone = jaxid.simulate(loop.add(effect), record)[0].tau
         # Contact is stiff: what rounding does to its first touch grows.

@@ -123,7 +123,7 @@ def _cross_matrix(x: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def _in_base(
     bodies: Float[Array, "joints 10"], turns: Float[Array, "joints 3 3"]
 ) -> tuple[Float[Array, "joints 3 3"], Float[Array, "joints 3"], Float[Array, "joints 1"]]:
-    """Inertia about the link's origin, first moment and mass of each link, along the base's axes."""
+    """Inertia about its origin, first moment and mass of each link, along the base's axes."""
     xx, xy, xz, yy, yz, zz = (bodies[:, k] for k in range(6))
     rows = [jnp.stack(row, axis=-1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
     own = jnp.stack(rows, axis=-2)

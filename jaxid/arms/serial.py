@@ -2,6 +2,7 @@
 
 import os
 from functools import lru_cache
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -57,7 +58,7 @@ class SerialArm(AbstractArm):
         base: str | None = None,
         tip: str | None = None,
         gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
-        gears: tuple[tuple[float, ...], ...] | None = None,
+        gears: Any = None,
     ) -> "SerialArm":
         """The arm that a URDF describes, from one of its links to another.
 
@@ -77,7 +78,7 @@ class SerialArm(AbstractArm):
         cls,
         found: Described,
         gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
-        gears: tuple[tuple[float, ...], ...] | None = None,
+        gears: Any = None,
     ) -> "SerialArm":
         """The arm of a description that was read."""
         if gears is not None and np.shape(gears) != (len(found.joints),) * 2:
@@ -93,7 +94,11 @@ class SerialArm(AbstractArm):
         chain = Chain(rotations, offsets, axes, gravity, slides)
         lower = tuple(joint.lower for joint in found.joints)
         upper = tuple(joint.upper for joint in found.joints)
-        matrix = None if gears is None else tuple(tuple(float(x) for x in row) for row in gears)
+        matrix = (
+            None
+            if gears is None
+            else tuple(tuple(float(x) for x in row) for row in np.asarray(gears))
+        )
         return cls(chain, found.bodies, lower, upper, matrix)
 
     @property
@@ -217,8 +222,8 @@ def _base_parameters(geometry, slides, lower, upper):
     import scipy
 
     n = len(slides)
-    shapes = (n, 3, 3), (n, 3), (n, 3), (3,)
-    chain = Chain(*(np.reshape(x, s) for x, s in zip(geometry, shapes, strict=True)), slides)
+    turns, places, axes, gravity = (np.asarray(x) for x in geometry)
+    chain = Chain(turns.reshape(n, 3, 3), places.reshape(n, 3), axes.reshape(n, 3), gravity, slides)
     rows, *_ = _regressor(chain, lower, upper)
     size = np.linalg.norm(rows, axis=0)
     size = np.where(size > 1e-9 * size.max(), size, 0.0)

@@ -15,8 +15,8 @@ def load_robot(robot: str) -> Any:
 
     **Arguments:**
 
-    - `robot`: `scara`, `two-link`, `emps`, a URDF file, or `path/to/file.py:name` of a loop, or of a
-      function without arguments that gives one.
+    - `robot`: `scara`, `two-link`, `emps`, a URDF file, or `path/to/file.py:name` of a loop, or of
+      a function without arguments that gives one.
 
     **Raises:** `ModelError` that says what was not found.
     """

@@ -203,7 +203,7 @@ def _separations(
         if not np.isfinite(seen[k]).all() or np.any(np.abs(tau) > 1.05 * limits.torque):
             continue
         data = Data(
-            residual=np.zeros_like(tau)[None],
+            residual=np.zeros((1, *base.shape[1:3])),
             base=base[k : k + 1],
             table=rows[k : k + 1],
             mask=kept[k : k + 1],

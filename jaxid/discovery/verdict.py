@@ -9,6 +9,7 @@ from jaxtyping import Float
 from ..estimate import Fit, Status
 from ..estimate.result import joint_columns
 from ..noise import ARFilter
+from .causes import likely_cause
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
 from .explore import DECISIVE
@@ -34,9 +35,14 @@ _ROSE = 3.0
 
 def misfit_of(fit: Fit) -> str:
     """Why a fit that explains next to nothing tells nothing, and what to do."""
-    return (
-        f"the fit of the model {fit.status.value}: check the units of each joint, signs, the order "
-        "of the joints, time stamps and the control law"
+    return f"the fit of the model {fit.status.value}: {_to_check(fit)}"
+
+
+def _to_check(fit: Fit) -> str:
+    """Which mistake explains a misfit, or what to look at."""
+    return likely_cause(fit.loop, fit.recordings) or (
+        "check the units of each joint, signs, the order of the joints, time stamps and the "
+        "control law"
     )
 
 
@@ -97,10 +103,7 @@ def _explains_little(fit: Fit, noise: Sequence[ARFilter]) -> str:
     left = over_recordings(fit.error_percent.to_numpy())
     for label, percent, filt in zip(joint_columns(fit.loop.joints), left, noise, strict=True):
         if percent > _THIRD and filt.gain > _COLOURED:
-            return (
-                f"it leaves {percent:.3g} % of {label}, and not as white noise: check the units of "
-                "each joint, signs, the order of the joints, time stamps and the control law"
-            )
+            return f"it leaves {percent:.3g} % of {label}, and not as white noise: {_to_check(fit)}"
     return ""
 
 

@@ -39,7 +39,7 @@ class Counterbalance(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Counterbalance"]:
-        """Joints that turn an arm in space, angles all round; half of them, for the sign is free."""
+        """Joints that turn an arm in space; angles half the way round, for the sign is free."""
         if scene.planar:
             return []
         angles = np.arange(8) * np.pi / 8 - np.pi / 2
