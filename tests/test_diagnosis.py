@@ -1,6 +1,7 @@
 """What a diagnosis says of a fit, and what it proposes to record next."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -124,6 +125,17 @@ def test_effect_given_as_an_object_is_screened(offset_story):
 
 
 @pytest.mark.xdist_group("offset")
+def test_next_experiment_knows_a_band():
+    """With the law unknown fewer rows are compared than a reference has samples."""
+    folder = Path(jaxid.__file__).parent / "demo" / "hidden"
+    recordings = jaxid.read(folder / "fit_1.csv", folder / "fit_2.csv")
+    fit = jaxid.fit(jaxid.scara(jaxid.control.Tracking()), recordings)
+    diagnosis = jaxid.diagnose(fit, progress=False)
+    pair = [v for v in diagnosis.ranking if v.hypothesis.name in ("stribeck", "spring")][:2]
+    proposed = jaxid.next_experiment(diagnosis, pair, tries=24, duration=12.0)
+    assert np.isfinite(proposed.then)
+
+
 def test_next_experiment_keeps_its_limits_and_separates(offset_story):
     story, _ = offset_story
     diagnosis = story.first_diagnosis

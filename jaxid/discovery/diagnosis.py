@@ -49,6 +49,10 @@ class Verdict(eqx.Module):
         return self.hypothesis.name, self.hypothesis.joint
 
 
+# Curves of which a story keeps what a fit of them needs.
+_CURVES = 6
+
+
 class Diagnosis(AbstractShown):
     """Where a fitted model fails and which effects may be missing, ranked.
 
@@ -95,9 +99,14 @@ class Diagnosis(AbstractShown):
         return all(v.p_value > self.significance for v in (*self.ranking, *self.where))
 
     def light(self) -> "Diagnosis":
-        """The same with the signatures of the ranking alone: all of them are large."""
+        """The same with the signatures of the ranking alone: all of them are large.
+
+        Of curves the products of the first few are kept, which are those that are drawn.
+        """
         ranked = sorted({c for v in self.ranking for c in v.hypothesis.columns})
-        return dataclasses.replace(self, data=self.data.only(ranked))
+        told = (*self.ranking, *self.forms, *self.pair, *self.where[:_CURVES])
+        products = sorted({c for v in told for c in v.hypothesis.columns})
+        return dataclasses.replace(self, data=self.data.only(ranked), gram=self.gram.only(products))
 
     def predicted(self, verdict: Verdict) -> AbstractEffect:
         """An effect with the amplitudes that its signature predicts."""

@@ -1,5 +1,6 @@
 """What to record next, so that effects which look alike can be told apart."""
 
+import dataclasses
 import html
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -132,8 +133,13 @@ def next_experiment(
         )
     best = int(np.nanargmax(np.where(np.isfinite(scores), scores, np.nan)))
     names = tuple(effect_on(*v.key) for v in chosen)
-    columns = [list(v.hypothesis.columns) for v in chosen]
-    now = _apart(diagnosis.gram, columns, [diagnosis.gram.amplitude(c)[0] for c in columns])
+    numbers = [list(v.hypothesis.columns) for v in chosen]
+    sizes = [diagnosis.gram.amplitude(c)[0] for c in numbers]
+    flat = [c for columns in numbers for c in columns]
+    # The products of these alone, which count from nothing.
+    at_hand = dataclasses.replace(diagnosis.gram.only(flat), kept=None)
+    columns = [[flat.index(c) for c in own] for own in numbers]
+    now = _apart(at_hand, columns, sizes)
     return Experiment(
         recording=runs[best],
         effects=names,

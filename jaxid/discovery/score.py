@@ -14,6 +14,21 @@ Rows = Float[np.ndarray, "recordings samples outputs"]
 Blocks = Sequence[Sequence[int]]
 
 
+def _places(numbers: Sequence[int], kept: tuple[int, ...] | None) -> list[int]:
+    """Where columns are among those that were kept; None where all were.
+
+    **Raises:** `FitError` where they have not been kept.
+    """
+    if kept is None:
+        return list(numbers)
+    if not set(numbers) <= set(kept):
+        raise FitError(
+            "a story keeps the signatures of its rankings alone: jaxid.diagnose(step.fit) has "
+            "all of them"
+        )
+    return [kept.index(number) for number in numbers]
+
+
 class Data(eqx.Module):
     """Residual and sensitivities at the samples; zero where there is no sample.
 
@@ -38,14 +53,7 @@ class Data(eqx.Module):
 
         **Raises:** `FitError` where they have not been kept.
         """
-        if self.kept is None:
-            return self.table[..., list(numbers)]
-        if not set(numbers) <= set(self.kept):
-            raise FitError(
-                "a story keeps the signatures of its rankings alone: jaxid.diagnose(step.fit) has "
-                "all of them"
-            )
-        return self.table[..., [self.kept.index(number) for number in numbers]]
+        return self.table[..., _places(numbers, self.kept)]
 
     def only(self, numbers: Sequence[int]) -> "Data":
         """The same with these columns of the table alone."""
@@ -190,7 +198,8 @@ class Whitened(eqx.Module):
 class Gram(eqx.Module):
     """Products of the signatures with each other and with the residual, as `Whitened` has them.
 
-    `rest` is what the base leaves of the squared residual, `count` its freedom.
+    `rest` is what the base leaves of the squared residual, `count` its freedom. `kept` are the
+    numbers of the columns that are there; None where all of them are.
     """
 
     gram: Float[np.ndarray, "columns columns"]
@@ -198,6 +207,13 @@ class Gram(eqx.Module):
     size: Float[np.ndarray, " columns"]
     rest: float
     count: float
+    kept: tuple[int, ...] | None = eqx.field(static=True, default=None)
+
+    def only(self, numbers: Sequence[int]) -> "Gram":
+        """The same with these columns alone."""
+        at = _places(numbers, self.kept)
+        gram, score, size = self.gram[np.ix_(at, at)], self.score[at], self.size[at]
+        return Gram(gram, score, size, self.rest, self.count, tuple(numbers))
 
     @classmethod
     def of(cls, data: Data, noise: Sequence[ARFilter]) -> "Gram":
@@ -242,15 +258,16 @@ class Gram(eqx.Module):
     def correlation(self, one: Sequence[int], other: Sequence[int]) -> float:
         """Largest correlation of what two blocks of columns span, 0 where one says nothing."""
         whole = []
-        for columns in (list(one), list(other)):
+        first, second = _places(one, self.kept), _places(other, self.kept)
+        for columns in (first, second):
             values, vectors = _strong(self.gram[np.ix_(columns, columns)])
             whole.append(vectors / np.sqrt(values))
-        across = whole[0].T @ self.gram[np.ix_(list(one), list(other))] @ whole[1]
+        across = whole[0].T @ self.gram[np.ix_(first, second)] @ whole[1]
         return float(min(1.0, np.linalg.norm(across, 2))) if across.size else 0.0
 
     def amplitude(self, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Estimated amplitudes of a block, in its own units, and their covariance."""
-        chosen = list(columns)
+        chosen = _places(columns, self.kept)
         inverse = _inverse(self.gram[np.ix_(chosen, chosen)])
         scale = self.size[chosen]
         return inverse @ self.score[chosen] / scale, inverse / np.outer(scale, scale)

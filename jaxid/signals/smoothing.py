@@ -6,7 +6,7 @@ import itertools
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ..errors import RecordingError
 from ..recording import Recording
@@ -164,7 +164,7 @@ class Band(eqx.Module):
         return passed * self.keep.reshape(*self.keep.shape, *axes)
 
     def picked(
-        self, x: Float[Array, "recordings samples *axes"]
-    ) -> Float[Array, "recordings rows *axes"]:
+        self, x: Shaped[Array, "recordings samples *axes"]
+    ) -> Shaped[Array, "recordings rows *axes"]:
         """The rows that are left of signals."""
         return x[jnp.arange(len(self.rows))[:, None], self.rows]
