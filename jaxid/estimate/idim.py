@@ -9,13 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..compiling import compiled
 from ..errors import FitError
 from ..parameters import Bounds, Parameter, write_values
 from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
 from .regression import Filtering, decimator, filtered, linear_parameters, regression
-from .result import AbstractMethod, Fit, Status, determined_covariance, relative_errors
+from .result import (
+    AbstractMethod,
+    Fit,
+    Status,
+    determined_covariance,
+    relative_errors,
+    unphysical,
+)
 
 Weights = Literal["ordinary", "joint", "robust"]
 
@@ -139,9 +145,10 @@ def regression_fit(
     if shaped:
         notes.append(f"{', '.join(shaped)} stayed as given: torque is not linear in them")
     notes += _beyond_bounds(chosen, solved.theta)
-    if float(_smallest_inertia(fitted.arm)) <= 0:
-        notes.append("these values are not physical: the mass matrix is not positive definite")
-        status = Status.unphysical if status is Status.converged else status
+    wrong = unphysical(fitted)
+    if wrong and status is Status.converged:
+        status = Status.unphysical
+    notes += wrong
     measured = stacked.split(stacked.right)
     residuals = stacked.split(solved.residual)
     return Fit(
@@ -169,9 +176,6 @@ def _beyond_bounds(chosen: Sequence[Parameter], theta: Float[np.ndarray, " p"]) 
     if not outside:
         return []
     return [f"{', '.join(outside)} outside the declared bounds, which a regression does not know"]
-
-
-_smallest_inertia = compiled(lambda arm: arm.smallest_inertia())
 
 
 class IDIM(AbstractMethod):

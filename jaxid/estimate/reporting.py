@@ -5,12 +5,13 @@ import numpy as np
 from ..noise import Noise, VectorAR
 from ..recording import Recordings
 from ..simulation.batch import compared
+from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from .converge import Converged
 from .covariance import SAID, Deviations, covariance_of
 from .minimise import with_derivatives
 from .pieces import rejoined
-from .result import AbstractMethod, Fit, relative_errors
+from .result import AbstractMethod, Fit, relative_errors, unphysical
 
 
 def report(
@@ -43,7 +44,9 @@ def report(
     measured = compared(done.loop, done.pieces, measured)
     errors = [r[:, :n] for r in unweighted]
     measured, errors = rejoined(recordings, done.pieces, measured, errors)
-    notes = (*_at_bounds(done.loop), *done.minimum.notes)
+    # Of a motion that is simulated, a minimisation has looked at it all along.
+    wrong = unphysical(done.loop) if imposed(done.loop) else []
+    notes = (*_at_bounds(done.loop), *wrong, *done.minimum.notes)
     return Fit(
         loop=done.loop,
         recordings=recordings,

@@ -12,6 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..compiling import compiled
 from ..display.shown import AbstractShown
 from ..errors import FitError, check_words
 from ..noise import ARFilter, VectorAR, innovations, ljung_box
@@ -321,3 +322,13 @@ def determined_covariance(
     covariance[:, lost] = 0.0
     covariance[lost, lost] = np.inf
     return covariance, tuple(sentences)
+
+
+def unphysical(loop: ClosedLoop) -> list[str]:
+    """What to say of an arm whose mass matrix is not positive definite."""
+    if float(_smallest_inertia(loop.arm)) > 0:
+        return []
+    return ["these values are not physical: the mass matrix is not positive definite"]
+
+
+_smallest_inertia = compiled(lambda arm: arm.smallest_inertia())

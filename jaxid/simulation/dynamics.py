@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from ..control import Reading, Reference
-from ..effects import AbstractEffect, AbstractTransmission, Motion
+from ..effects import AbstractEffect, AbstractTransmission, DriveGain, Motion
 from .loop import ClosedLoop
 
 
@@ -259,16 +259,17 @@ def imposed(loop: ClosedLoop) -> bool:
     """Whether the motion is the reference itself, so that nothing of it needs to be simulated.
 
     It is under a law that imposes it, but for effects that give the arm a motion of its own and for
-    drives whose torque depends on past or limited commands.
+    drives that do more to a command than multiply it, whose command cannot be told from its torque.
     """
     return loop.controller.imposes and not any(
         isinstance(effect, AbstractTransmission)
-        or (_drives(effect) and (effect.finite or effect.initial_state().size > 0))
+        or (_drives(effect) and not isinstance(effect, DriveGain))
         for effect in loop.effects
     )
 
 
 def _drives(effect: AbstractEffect) -> bool:
+    """Whether it makes something else of a command."""
     return type(effect).command is not AbstractEffect.command
 
 
@@ -282,7 +283,6 @@ def _along_reference(
 ) -> Instant:
     """Inverse dynamics at one instant of the motion at which the sensors read the reference."""
     noise, seen = outside.noise, Reading(reference.q, reference.v)
-
     at = seen.q - noise.q, seen.v - noise.v
     rates = seen.v - noise.v, reference.a - outside.noise_rate
     (q, v), (_, a) = jax.jvp(lambda q, v: behind(loop, q, v), at, rates)
@@ -302,10 +302,7 @@ def _along_reference(
 def _commanded(
     loop: ClosedLoop, motion: Motion, tau: Float[Array, " joints"]
 ) -> Float[Array, " joints"]:
-    """The command at which drives without memory deliver a torque, `(joints,)`: Newton's step.
-
-    Their gains are all that there is, and each joint's is its own: one step is exact.
-    """
+    """The command at which drives that multiply it deliver a torque, `(joints,)`."""
     drives = [effect for effect in loop.effects if _drives(effect)]
     if not drives:
         return tau
@@ -315,8 +312,8 @@ def _commanded(
             command = effect.command(dataclasses.replace(motion, tau=command))
         return command
 
-    now, gain = jax.jvp(delivered, (tau,), (jnp.ones_like(tau),))
-    return tau + (tau - now) / gain
+    # Each joint's gain is its own.
+    return tau / delivered(jnp.ones_like(tau))
 
 
 def _beside_bodies(
