@@ -19,11 +19,11 @@ class Tracking(AbstractController):
     Where no effect gives the arm a motion of its own, q_m is imposed, and nothing is simulated.
     Otherwise only the tracking has to be alike for the simulated torque to be held against the
     measured one (Gautier, Janot, Vandanjon 2013). M is the model's mass matrix and h all else that
-    its motion takes, friction included: the torque is that of inverse dynamics along the recorded motion, and
-    feedback is left with what gives the arm a motion of its own. The recorded motion is
-    low-passed, forward and backward, so that noise is not differentiated into torque. The measured
-    torque holds what that motion cannot explain, so it and the simulated one pass the same filter
-    before they are compared (the parallel filter of Gautier 1997).
+    its motion takes, friction included: the torque is that of inverse dynamics along the recorded
+    motion, and feedback is left with what gives the arm a motion of its own. The recorded motion
+    is low-passed, forward and backward, so that noise is not differentiated into torque. The
+    measured torque holds what that motion cannot explain, so it and the simulated one pass the
+    same filter before they are compared (the parallel filter of Gautier 1997).
 
     **Arguments:**
 
