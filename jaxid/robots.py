@@ -103,7 +103,7 @@ def serial(
     held = [p.name for p in loop.parameters if p.declaration.symbol == "base"]
     if bodies == "free":
         # The first rotor's inertia, and others', are parts of base parameters.
-        held = [f"Ia{j}" for j, inside in enumerate(arm.hold_rotor(), start=1) if inside]
+        held = [f"Ia{j}" for j, inside in enumerate(arm.absorbed_rotors(), start=1) if inside]
     elif rotors is not None:
         held += [f"Ia{j}" for j in range(1, n + 1)]
     return loop.hold(*held)

@@ -33,6 +33,10 @@ MISTAKES = {
     "all signs": (lambda r: {"tau": -r.tau}, "torque of all joints looks as if its sign"),
     "swapped": (lambda r: {"tau": r.tau[:, ::-1]}, "torques of joints 1 and 2"),
     "degrees": (lambda r: {"q": np.rad2deg(r.q)}, "position of all joints looks .* degrees, not"),
+    "noise alone": (
+        lambda r: {"q": r.q * [1, 0] + 1e-4 * np.random.default_rng(1).normal(size=r.q.shape)},
+        "joint 2 moves by",
+    ),
     "still": (lambda r: {"q": r.q * [1, 0]}, "joint 2 moves by 0 only"),
 }
 

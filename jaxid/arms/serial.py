@@ -30,7 +30,10 @@ class SerialArm(AbstractArm):
     - `lower`, `upper`: limits of the joints, `(joints,)`, rad or m.
     - `gears`: turns of each motor for those of each joint, `(joints, joints)`, where motors drive
       more than their own joint; None where each has its own.
-    - `base`: values of the base parameters; those of `bodies` by default.
+    - `base`: values of the base parameters, `(base,)`, in kg·m², kg·m or kg as their names say;
+      those of `bodies` by default.
+    - `leading`, `base_names`, `combined`: as `base_parameters` finds them, which it is asked where
+      they are left out.
     """
 
     chain: Chain = eqx.field(metadata=KNOWN)
@@ -150,9 +153,9 @@ class SerialArm(AbstractArm):
         """Torque that a motion takes, `(joints,)`, N·m or N, without the inertia matrix."""
         return self.chain.inverse(self.inertias(), q, v, a)
 
-    def hold_rotor(self) -> tuple[bool, ...]:
+    def absorbed_rotors(self) -> tuple[bool, ...]:
         """Of which joints the rotor's inertia is a part of base parameters, `(joints,)`."""
-        rows, _, a = _regressor(self.chain, self.lower, self.upper)
+        rows, a = _regressor(_geometry(self.chain), self.chain.slides, self.lower, self.upper)
         basis = np.linalg.qr(rows[:, np.asarray(self.leading)])[0]
         found = []
         for j in range(self.joints):
@@ -210,21 +213,35 @@ def base_parameters(
     **Returns:** the place of the parameter that leads each combination, its name (with an R where
     others are added to it), and the combinations, `(base, 10 · joints)`.
     """
-    geometry = tuple(
-        tuple(np.asarray(x).ravel().tolist())
-        for x in (chain.rotations, chain.offsets, chain.axes, chain.gravity)
-    )
-    return _base_parameters(geometry, chain.slides, lower, upper)
+    return _base_parameters(_geometry(chain), chain.slides, lower, upper)
+
+
+Geometry = tuple[tuple[float, ...], ...]
+
+
+def _geometry(chain: Chain) -> Geometry:
+    """A chain's numbers as what a cache can look up."""
+    arrays = chain.rotations, chain.offsets, chain.axes, chain.gravity
+    return tuple(tuple(np.asarray(x).ravel().tolist()) for x in arrays)
+
+
+def _chain(geometry: Geometry, slides: tuple[bool, ...]) -> Chain:
+    n = len(slides)
+    turns, places, axes, gravity = (np.asarray(x) for x in geometry)
+    return Chain(turns.reshape(n, 3, 3), places.reshape(n, 3), axes.reshape(n, 3), gravity, slides)
 
 
 @lru_cache(maxsize=64)
-def _base_parameters(geometry, slides, lower, upper):
+def _base_parameters(
+    geometry: Geometry,
+    slides: tuple[bool, ...],
+    lower: tuple[float, ...],
+    upper: tuple[float, ...],
+) -> tuple[tuple[int, ...], tuple[str, ...], Float[np.ndarray, "base parameters"]]:
     import scipy
 
-    n = len(slides)
-    turns, places, axes, gravity = (np.asarray(x) for x in geometry)
-    chain = Chain(turns.reshape(n, 3, 3), places.reshape(n, 3), axes.reshape(n, 3), gravity, slides)
-    rows, *_ = _regressor(chain, lower, upper)
+    chain = _chain(geometry, slides)
+    rows, _ = _regressor(geometry, slides, lower, upper)
     size = np.linalg.norm(rows, axis=0)
     size = np.where(size > 1e-9 * size.max(), size, 0.0)
     kept: list[int] = []
@@ -259,11 +276,15 @@ def _led(place: int, chain: Chain) -> tuple[bool, int]:
     return BODY[place % 10] in led, place
 
 
+@lru_cache(maxsize=8)
 def _regressor(
-    chain: Chain, lower: tuple[float, ...], upper: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Torque by all bodies' parameters at drawn states, one row a joint; speeds; accelerations."""
-    n = chain.joints
+    geometry: Geometry,
+    slides: tuple[bool, ...],
+    lower: tuple[float, ...],
+    upper: tuple[float, ...],
+) -> tuple[Float[np.ndarray, "rows parameters"], Float[np.ndarray, "states joints"]]:
+    """Torque by all bodies' parameters at drawn states, a row a joint; and the accelerations."""
+    chain, n = _chain(geometry, slides), len(slides)
     rng = np.random.default_rng(0)
     q = rng.uniform(lower, upper, (20 * n, n))
     v, a = rng.normal(size=(2, 20 * n, n))
@@ -272,4 +293,4 @@ def _regressor(
         jax.jacfwd(lambda bodies, *at: chain.inverse(bodies, *at)), (None, 0, 0, 0)
     )
     rows = jax.jit(by_bodies)(jnp.zeros((n, 10)), q, v, a)
-    return np.asarray(rows).reshape(-1, 10 * n), v, a
+    return np.asarray(rows).reshape(-1, 10 * n), a

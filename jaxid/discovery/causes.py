@@ -18,6 +18,8 @@ from ..simulation.loop import ClosedLoop
 # Share of the squared error that a mistake must account for to be named, and the error in % that a
 # regression without it must come below: what a model of a robot does not leave.
 _SHARE, _LEAST = 0.25, 33.0
+# Deviations of white noise that a long recording of it spans.
+_STILL = 12.0
 # Factors between units that are taken for each other.
 _FACTORS = {
     "in degrees, not in rad": np.pi / 180,
@@ -53,9 +55,11 @@ def likely_cause(loop: ClosedLoop, recordings: Recordings) -> str:
 
 
 def _still(recordings: Recordings) -> Iterator[tuple[str, float]]:
-    """Joints that do not move in any recording."""
+    """Joints that show their sensor's noise alone in every recording, and by how much, rad or m."""
     span = np.max([np.ptp(r.q, axis=0) for r in recordings], axis=0)
-    for j in np.flatnonzero(span < 1e-4 * span.max()):
+    # Third differences of white noise are √20 times as large, and those of a motion next to none.
+    noise = [np.std(np.diff(r.q, 3, axis=0), axis=0) / np.sqrt(20) for r in recordings]
+    for j in np.flatnonzero(span <= _STILL * np.max(noise, axis=0)):
         yield f"joint {j + 1}", float(span[j])
 
 

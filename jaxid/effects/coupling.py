@@ -17,7 +17,7 @@ class SharedShaft(AbstractEffect):
 
     The motor of a wrist's last joint often reaches it through the joint before, and turns with
     w = share v_i + v_j. Its friction Fv w + Fc sigma(w) and inertia I w' load both joints
-    (Gautier, Janot 2012, on the Stäubli TX40).
+    (as FIGAROH has it for a Stäubli TX40).
 
     **Arguments:**
 
