@@ -136,9 +136,10 @@ def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
         part = abs(late) * np.linalg.norm(rows[..., j]) / np.linalg.norm(rest)
         large = part**2 > 1 - 1 / _REFUTED**2 and part * percent[j] > worth
         if large and abs(float(own @ left)) > _SURE * chance:
+            order = "before" if late > 0 else "after"
             return (
-                f"what is left of {label} is as if its torque were recorded {1e3 * late:.3g} ms "
-                "before it acts: check time stamps, filters on one of the signals and delays of "
+                f"what is left of {label} is as if its torque were recorded "
+                f"{1e3 * abs(late):.3g} ms {order} it acts: check time stamps, filters on one of the signals and delays of "
                 f"the drive, which jaxid.control.Tracking(delay={late:.3g}) knows of where the law "
                 "is unknown"
             )
