@@ -139,9 +139,9 @@ def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
             order = "before" if late > 0 else "after"
             return (
                 f"what is left of {label} is as if its torque were recorded "
-                f"{1e3 * abs(late):.3g} ms {order} it acts: check time stamps, filters on one of the signals and delays of "
-                f"the drive, which jaxid.control.Tracking(delay={late:.3g}) knows of where the law "
-                "is unknown"
+                f"{1e3 * abs(late):.3g} ms {order} it acts: check time stamps, filters on one of "
+                "the signals and delays of the drive, which "
+                f"jaxid.control.Tracking(delay={late:.3g}) knows of where the law is unknown"
             )
     return ""
 
