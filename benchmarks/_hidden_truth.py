@@ -34,15 +34,15 @@ def in_jaxid(effect: Any, plant: Any) -> fx.AbstractEffect:
     e, j = effect, effect.joint
     match type(effect).__name__:
         case "Stribeck":
-            return fx.Stribeck(j, e.torque, e.velocity, e.gamma)
+            return fx.Stribeck(j, e.torque, e.velocity, 1 / e.gamma)
         case "AsymmetricFriction":
-            return fx.AsymmetricFriction(j, e.viscous, e.coulomb, e.gamma)
+            return fx.AsymmetricFriction(j, e.viscous, e.coulomb, 1 / e.gamma)
         case "QuadraticDrag":
             return fx.QuadraticDrag(j, e.drag)
         case "LoadDependentFriction":
-            return fx.LoadDependentFriction(j, e.ratio, e.gamma)
+            return fx.LoadDependentFriction(j, e.ratio, 1 / e.gamma)
         case "PositionDependentFriction":
-            return fx.PositionDependentFriction(j, e.A1, e.B1, e.A2, e.B2, e.gamma)
+            return fx.PositionDependentFriction(j, e.A1, e.B1, e.A2, e.B2, 1 / e.gamma)
         case "Dahl":
             return fx.Hysteresis(j, e.torque, e.displacement)
         case "LuGre":
@@ -80,7 +80,7 @@ def in_jaxid(effect: Any, plant: Any) -> fx.AbstractEffect:
         case "ThermalDrift":
             viscous, coulomb = plant.friction_parameters()[j - 1]
             viscous, coulomb = e.amplitude * viscous, e.amplitude * coulomb
-            return fx.ThermalDrift(j, viscous, coulomb, e.time_constant, plant.gamma)
+            return fx.ThermalDrift(j, viscous, coulomb, e.time_constant, 1 / plant.gamma)
         case "PeriodicDisturbance":
             cos, sin = e.amplitude * np.sin(e.phase), e.amplitude * np.cos(e.phase)
             return fx.PeriodicDisturbance(j, float(cos), float(sin), e.frequency)

@@ -89,7 +89,7 @@ def table(quick: bool = False) -> pd.DataFrame:
             rows[name] = {"note": str(error).split(":")[0]}
     for name, found in fits.items():
         values = {p.name: float(p.where(found.loop)) for p in found.loop.parameters}
-        kept = {k: x for k, x in values.items() if not k.startswith("gamma")}
+        kept = {k: x for k, x in values.items() if not k.startswith("eps")}
         took = {"iterations": found.iterations, "seconds": round(found.seconds, 1)}
         rows[name] = kept | took
         try:

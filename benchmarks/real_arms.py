@@ -91,7 +91,7 @@ def fits(quick: bool) -> pd.DataFrame:
         ("KR300", "and a spring on joint 2"): row(sprung, a, b, Spring(joint=2)),
         ("KR300", "and a counterbalance"): row(loop, a, b, Counterbalance(joint=2, angle=0.1)),
     }
-    shaft = SharedShaft(joint=5, driven=6, gamma=1e4)
+    shaft = SharedShaft(joint=5, driven=6, smoothing=1e-4)
     loop, whole, first, rest = tx40("drawn" if quick else "free")
     what = "bodies as drawn" if quick else "base parameters free"
     rows |= {

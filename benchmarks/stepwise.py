@@ -172,14 +172,14 @@ def survey(
         np.concatenate([np.asarray(getattr(m, n)) for m in motions]) for n in ["q", "v", "tau"]
     )
     mass = np.asarray(jax.vmap(loop.arm.mass_matrix)(jnp.asarray(q[::50])))
-    sharp = {e.joint: float(e.gamma) for e in loop.effects if isinstance(e, fx.Coulomb)}
+    smoothed = {e.joint: float(e.smoothing) for e in loop.effects if isinstance(e, fx.Coulomb)}
     return fx.Scene(
         q.min(axis=0),
         q.max(axis=0),
         np.abs(v).max(axis=0),
         np.abs(tau).max(axis=0),
         np.einsum("kjj->j", mass) / len(mass),
-        np.array([sharp.get(j, 100.0) for j in range(1, loop.joints + 1)]),
+        np.array([smoothed.get(j, 0.01) for j in range(1, loop.joints + 1)]),
         float(np.median([r.period for r in recordings])),
         float(max(r.duration for r in recordings)),
         tuple(recordings.names),

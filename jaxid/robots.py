@@ -14,8 +14,10 @@ from .errors import ModelError
 from .simulation.loop import ClosedLoop
 
 
-def _friction(joints: int, gamma: float = 100.0) -> tuple[Viscous | Coulomb, ...]:
-    pairs = [(Viscous(joint=j), Coulomb(joint=j, gamma=gamma)) for j in range(1, joints + 1)]
+def _friction(joints: int, smoothing: float = 0.01) -> tuple[Viscous | Coulomb, ...]:
+    pairs = [
+        (Viscous(joint=j), Coulomb(joint=j, smoothing=smoothing)) for j in range(1, joints + 1)
+    ]
     return tuple(effect for pair in pairs for effect in pair)
 
 
@@ -52,11 +54,11 @@ def emps(controller: AbstractController | None = None) -> ClosedLoop:
 
     - `controller`: another law, for instance `Cascade(delay=True)`.
     """
-    friction = Viscous(joint=1, coefficient=100.0), Coulomb(joint=1, level=10.0, gamma=2e4)
+    friction = Viscous(joint=1, coefficient=100.0), Coulomb(joint=1, level=10.0, smoothing=5e-5)
     effects = (*friction, TorqueOffset(joint=1))
-    # At these speeds the sign's sharpness shows in the force, and nobody knows it: fits find it.
+    # At these speeds the sign's smoothing shows in the force, and nobody knows it: fits find it.
     law = controller or Cascade()
-    return ClosedLoop(Axis(), law, effects, name="emps").free("gamma1")
+    return ClosedLoop(Axis(), law, effects, name="emps").free("eps1")
 
 
 def serial(
@@ -93,9 +95,8 @@ def serial(
     if rotors is not None and len(rotors) != n:
         raise ModelError(f"rotors are given for {len(rotors)} of {n} joints: give one for each")
     own = np.zeros(n) if rotors is None else np.asarray(rotors, float)
-    # Along a given motion a sharp sign costs nothing; one that is too soft leaves its shape.
     effects = (
-        *_friction(n, gamma=1e4),
+        *_friction(n),
         *(TorqueOffset(joint=j) for j in range(1, n + 1)),
         *(RotorInertia(joint=j, inertia=float(own[j - 1])) for j in range(1, n + 1)),
     )
@@ -106,4 +107,6 @@ def serial(
         held = [f"Ia{j}" for j, inside in enumerate(arm.absorbed_rotors(), start=1) if inside]
     elif rotors is not None:
         held += [f"Ia{j}" for j in range(1, n + 1)]
-    return loop.hold(*held)
+    # How friction turns over near standstill nobody knows, and where motions rest it matters most.
+    smoothings = [p.name for p in loop.parameters if p.declaration.symbol == "eps"]
+    return loop.hold(*held).free(*smoothings)

@@ -38,7 +38,7 @@ TWO_LINK_VALUES = {
     "Fc2": 0.05,
 }
 TWO_LINK_GAINS = {"Kp": (60.0, 120.0), "Kv": (10.0, 15.0), "Kg": (0.15, 0.045)}
-EMPS_VALUES = {"M": 95.1, "Fv1": 203.5, "Fc1": 20.4, "offset1": -3.16, "gamma1": 1e4}
+EMPS_VALUES = {"M": 95.1, "Fv1": 203.5, "Fc1": 20.4, "offset1": -3.16, "eps1": 1e-4}
 FINE = jaxid.Stepping(substeps=8)
 # A tenth of a millimetre's worth of torque: the spline through the reference errs by 2e-6 rad
 # where the fading's third derivative jumps, 60 rad/s³ · (10 ms)³ / 24; gains are up to 22 N·m/rad.

@@ -205,7 +205,7 @@ PAIRS = {
         sim.TwoLink(),
     ),
     "emps": (
-        jaxid.emps().with_values(M=95.1, Fv1=203.5, Fc1=20.4, gamma1=1e4, offset1=-3.16),
+        jaxid.emps().with_values(M=95.1, Fv1=203.5, Fc1=20.4, eps1=1e-4, offset1=-3.16),
         sim.Axis(),
     ),
 }
@@ -302,7 +302,7 @@ class FrictionWork(AbstractEffect):
 
     def derivative(self, motion):
         """Power, W."""
-        needed = self.viscous * motion.v + self.level * smooth_sign(motion.v, jnp.asarray(100.0))
+        needed = self.viscous * motion.v + self.level * smooth_sign(motion.v, jnp.asarray(0.01))
         return jnp.sum(needed * motion.v)[None]
 
 

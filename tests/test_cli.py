@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import jaxid
 import jaxid.discovery
 from jaxid.cli import app
-from jaxid.cli.models import load_robot, with_fitted
+from jaxid.cli.models import load_robot, saved_model
 from jaxid.errors import ModelError
 
 DEMO = Path(jaxid.__file__).parent / "demo" / "clean"
@@ -33,6 +33,9 @@ wrong = 3
 """
 
 
+SCARA = ("--robot", "scara")
+
+
 def run(*arguments):
     """The command's result; an exception that it does not turn into a sentence is raised."""
     return CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
@@ -42,7 +45,7 @@ def run(*arguments):
 def fitted(tmp_path_factory):
     """A fit by the command: what it printed, and the file that it wrote."""
     path = tmp_path_factory.mktemp("cli") / "fit.json"
-    return run("fit", FIT_1, FIT_2, "--json", path), path
+    return run("fit", FIT_1, FIT_2, *SCARA, "--json", path), path
 
 
 def test_fit_prints_a_table_and_writes_the_same_as_json(fitted):
@@ -62,14 +65,14 @@ def test_fit_prints_a_table_and_writes_the_same_as_json(fitted):
 def test_compare_takes_what_fit_wrote(fitted, tmp_path):
     _, path = fitted
     out, figure = tmp_path / "compare.json", tmp_path / "compare.html"
-    result = run("compare", HELD_OUT, "--fit", path, "--json", out, "--plot", figure)
+    result = run("compare", HELD_OUT, *SCARA, "--fit", path, "--json", out, "--plot", figure)
     assert result.exit_code == 0
     errors = json.loads(out.read_text(encoding="utf-8"))["error_percent"]["held_out"]
     assert all(1.4 < x < 1.7 for x in errors)
     assert f"{errors[0]:.4g}" in result.stdout
     assert "plotly" in figure.read_text(encoding="utf-8")
     # The CAD start is far off, so the fitted values were used.
-    start = run("compare", HELD_OUT)
+    start = run("compare", HELD_OUT, *SCARA)
     assert start.exit_code == 0
     assert f"{errors[0]:.4g}" not in start.stdout
 
@@ -77,7 +80,7 @@ def test_compare_takes_what_fit_wrote(fitted, tmp_path):
 @pytest.mark.parametrize("method", ["idim", "didim", "idim-iv"])
 def test_other_methods_by_name(method, tmp_path):
     path = tmp_path / "fit.json"
-    assert run("fit", FIT_1, "--method", method, "--json", path).exit_code == 0
+    assert run("fit", FIT_1, *SCARA, "--method", method, "--json", path).exit_code == 0
     name = {"idim": "IDIM(", "didim": "DIDIM(", "idim-iv": "IDIMIV("}[method]
     assert json.loads(path.read_text(encoding="utf-8"))["method"].startswith(name)
 
@@ -103,9 +106,11 @@ def test_columns_and_units_by_name(tmp_path):
     columns = ("--column", "time=time", "--column", "q=angle_a,angle_b")
     columns += ("--column", "q_ref=q_ref_1,q_ref_2", "--column", "tau=tau_1,tau_2")
     units = ("--unit", "q=deg", "--unit", "q_ref=deg")
-    here = run("fit", tmp_path / "degrees.csv", *columns, *units, "--method", "idim", "--json", one)
+    here = run(
+        "fit", tmp_path / "degrees.csv", *SCARA, *columns, *units, "--method", "idim", "--json", one
+    )
     assert here.exit_code == 0, here.stderr
-    run("fit", FIT_1, "--method", "idim", "--json", other)
+    run("fit", FIT_1, *SCARA, "--method", "idim", "--json", other)
     values = [json.loads(p.read_text(encoding="utf-8"))["parameters"] for p in (one, other)]
     for name, entry in values[0].items():
         assert entry["value"] == pytest.approx(values[1][name]["value"], rel=1e-6, abs=1e-9)
@@ -126,16 +131,21 @@ def test_a_fit_that_failed_ends_with_one(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["fit", "absent.csv"], "absent.csv"),
+        (["fit", "absent.csv", *SCARA], "absent.csv"),
+        (["fit", FIT_1], "no robot is named"),
+        (["compare", FIT_1], "no robot is named"),
+        (["fit", FIT_1, *SCARA, "--log", "absent.toml"], "jaxid inspect --write makes one"),
+        (["fit", FIT_1, *SCARA, "--gaps", "maybe"], "give refuse or allow"),
+        (["fit", FIT_1, *SCARA, "--unit", "q=deg,deg,deg"], "3 units for q of 2 joints"),
         (["fit", FIT_1, "--robot", "delta"], "there is no robot 'delta': choose scara"),
         (["fit", FIT_1, "--robot", "absent.py:loop"], "there is no file absent.py"),
         (["fit", FIT_1, "--robot", "emps"], "choose another robot"),
-        (["fit", FIT_1, "--method", "guess"], "there is no method 'guess': choose oem"),
-        (["fit", FIT_1, "--controller", "fuzzy"], "there is no controller 'fuzzy'"),
-        (["fit", FIT_1, "--column", "q"], "has no '='"),
-        (["fit", FIT_1, "--unit", "q=parsec"], "is not a unit known for q"),
-        (["fit", FIT_1, "--window", "0.01"], "make it longer"),
-        (["compare", FIT_1, "--fit", FIT_1], "holds no fitted parameters"),
+        (["fit", FIT_1, *SCARA, "--method", "guess"], "there is no method 'guess': choose oem"),
+        (["fit", FIT_1, *SCARA, "--controller", "fuzzy"], "there is no controller 'fuzzy'"),
+        (["fit", FIT_1, *SCARA, "--column", "q"], "has no '='"),
+        (["fit", FIT_1, *SCARA, "--unit", "q=parsec"], "is not a unit known for q"),
+        (["fit", FIT_1, *SCARA, "--window", "0.01"], "make it longer"),
+        (["compare", FIT_1, *SCARA, "--fit", FIT_1], "holds no fitted parameters"),
     ],
 )
 def test_a_users_error_is_one_sentence(arguments, says, tmp_path, monkeypatch):
@@ -171,7 +181,7 @@ def test_annotations_of_ones_own_robot_may_be_strings(tmp_path):
 
 
 def test_windows_are_refused_where_nothing_is_simulated():
-    result = run("fit", FIT_1, "--method", "idim", "--window", "1")
+    result = run("fit", FIT_1, *SCARA, "--method", "idim", "--window", "1")
     assert result.exit_code == 2
     assert "leave out --window" in result.stderr
 
@@ -187,7 +197,7 @@ def test_vectors_come_back_from_a_file_of_fitted_parameters(tmp_path):
     values = {name: 0.01 * k for k, name in enumerate(loop.names, start=1)}
     found = {"parameters": {name: {"value": value} for name, value in values.items()}}
     path.write_text(json.dumps(found))
-    assert np.allclose(with_fitted(loop, path).theta, list(values.values()))
+    assert np.allclose(saved_model(f"{own}:loop", path).theta, list(values.values()))
 
 
 def test_demo_tells_both_stories_on_files_that_are_shipped(monkeypatch):
@@ -223,11 +233,11 @@ def test_demo_tells_both_stories_on_files_that_are_shipped(monkeypatch):
 
 def test_quiet_is_one_line(fitted):
     _, path = fitted
-    result = run("compare", HELD_OUT, "--fit", path, "--quiet")
+    result = run("compare", HELD_OUT, *SCARA, "--fit", path, "--quiet")
     assert result.exit_code == 0
     assert len(result.stdout.splitlines()) == 1
     assert result.stdout.startswith("scara: joint 1 1.5")
-    brief = run("fit", FIT_1, "--method", "idim", "-q").stdout.splitlines()
+    brief = run("fit", FIT_1, *SCARA, "--method", "idim", "-q").stdout.splitlines()
     assert len(brief) == 1
     assert brief[0].startswith("IDIM(")
 

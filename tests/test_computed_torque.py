@@ -31,7 +31,7 @@ def test_sampled_law_is_that_of_the_independent_simulator():
     law = sim.SampledComputedTorque(MODEL, **GAINS, period=TICK, window=3)
     expected = sim.simulate_batch([TRUE], reference(t), law, np.zeros(1), substeps=20)
     own = ComputedTorque(ARM, **GAINS, every=TICK, window=3)
-    loop = jaxid.two_link(own).with_values(**TRUTH, gamma1=20.0, gamma2=20.0)
+    loop = jaxid.two_link(own).with_values(**TRUTH, eps1=0.05, eps2=0.05)
     asked = jaxid.Recording.from_arrays(t, expected.q[0], expected.tau[0], q_ref=reference(t)[0])
     run = jaxid.simulate(loop, asked)[0]
     assert np.abs(run.q - expected.q[0]).max() < 1e-5

@@ -34,7 +34,7 @@ def with_plant(loop, plant, **settings):
     """The loop with the independent plant's values."""
     joints = range(1, loop.joints + 1)
     values = {}
-    values |= {f"gamma{j}": float(plant.gamma) for j in joints}
+    values |= {f"eps{j}": 1 / plant.gamma for j in joints}
     for j, (fv, fc) in zip(joints, plant.friction_parameters(), strict=True):
         values |= {f"Fv{j}": fv, f"Fc{j}": fc}
     values |= {name: getattr(plant, name) for name in loop.names if hasattr(plant, name)}

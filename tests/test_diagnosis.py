@@ -92,7 +92,7 @@ def test_a_joint_that_is_held_still_has_shapes_to_screen():
 
 def test_a_diagnosis_begins_where_its_fit_did():
     """At a first velocity that a parabola through noisy samples tells badly."""
-    loop = jaxid.emps(jaxid.control.PD(Kp=[9e3], Kv=[600.0])).with_values(M=90.0, gamma1=100.0)
+    loop = jaxid.emps(jaxid.control.PD(Kp=[9e3], Kv=[600.0])).with_values(M=90.0, eps1=0.01)
     loop = dataclasses.replace(loop, freed=frozenset())
     time = np.arange(0, 3, 0.01)
     q_ref = 0.1 * np.sin(3 * time[:, None] + 1.0)

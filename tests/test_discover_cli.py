@@ -23,6 +23,7 @@ pytestmark = pytest.mark.xdist_group("demo")
 
 DEMO = Path(jaxid.__file__).parent / "demo"
 HIDDEN = [str(DEMO / "hidden" / f"{name}.csv") for name in ("fit_1", "fit_2", "held_out")]
+SCARA = ("--robot", "scara")
 
 
 HOSE = """
@@ -75,7 +76,7 @@ def told() -> Told:
         # Two files after one --validate: the second is held out as well.
         twin = folder / "other_day.csv"
         twin.write_bytes(Path(HIDDEN[2]).read_bytes())
-        command = ["discover", *HIDDEN[:2], "--validate", HIDDEN[2], str(twin), *options]
+        command = ["discover", *HIDDEN[:2], "--validate", HIDDEN[2], str(twin), *SCARA, *options]
         result = CliRunner().invoke(app, command, catch_exceptions=False)
     return Told(
         result.output,
@@ -146,7 +147,9 @@ def test_an_effect_of_the_users_is_asked_beside_the_known_ones(tmp_path: Path) -
     (tmp_path / "own.py").write_text(HOSE, encoding="utf-8")
     own = ["--catalogue", str(tmp_path / "own.py") + ":Hose"]
     with mock.patch.object(jaxid.discovery, "discover", listening):
-        run = CliRunner().invoke(app, ["discover", *HIDDEN[:2], *own], catch_exceptions=False)
+        run = CliRunner().invoke(
+            app, ["discover", *HIDDEN[:2], *SCARA, *own], catch_exceptions=False
+        )
     assert run.exit_code == 0
     assert tuple(asked[:-1]) == jaxid.catalogue
     assert asked[-1].effect_name() == "hose"
@@ -163,13 +166,15 @@ def test_what_is_asked_and_the_exit_code_follow_the_options() -> None:
 
     options = ["--exclude", "stribeck", "--worth", "2"]
     with mock.patch.object(jaxid.discovery, "discover", listening):
-        run = CliRunner().invoke(app, ["discover", *HIDDEN[:2], *options], catch_exceptions=False)
+        run = CliRunner().invoke(
+            app, ["discover", *HIDDEN[:2], *SCARA, *options], catch_exceptions=False
+        )
     assert run.exit_code == 3
     assert "of a test" in run.stdout
     assert asked["worth"] == 2
     left = {entry.effect_name() for entry in asked["catalogue"]}
     assert left == {entry.effect_name() for entry in jaxid.catalogue} - {"stribeck"}
-    run = CliRunner().invoke(app, ["discover", *HIDDEN[:2], "--exclude", "stribec"])
+    run = CliRunner().invoke(app, ["discover", *HIDDEN[:2], *SCARA, "--exclude", "stribec"])
     assert run.exit_code == 2
     assert "no effect 'stribec'" in run.stderr
 
@@ -234,19 +239,20 @@ def test_one_option_takes_several_files(given: str, meant: str) -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["absent.csv"], "there is no such file"),
-        ([HIDDEN[0], "--validate", HIDDEN[0]], "both to be fitted and held out"),
+        (["absent.csv", *SCARA], "there is no such file"),
+        ([HIDDEN[0]], "no robot is named"),
+        ([HIDDEN[0], *SCARA, "--validate", HIDDEN[0]], "both to be fitted and held out"),
         ([HIDDEN[0], "--robot", "kuka"], "there is no robot 'kuka'"),
         ([HIDDEN[0], "--robot", "absent.py:loop"], "there is no file absent.py"),
-        ([HIDDEN[0], "--catalogue", "absent.py:Hose"], "there is no file absent.py"),
-        ([HIDDEN[0], "--catalogue", "stribeck"], "give FILE.py:NAME of its class"),
-        ([HIDDEN[0], "--catalogue", f"{__file__}:Hose"], "has no effect called 'Hose'"),
+        ([HIDDEN[0], *SCARA, "--catalogue", "absent.py:Hose"], "there is no file absent.py"),
+        ([HIDDEN[0], *SCARA, "--catalogue", "stribeck"], "give FILE.py:NAME of its class"),
+        ([HIDDEN[0], *SCARA, "--catalogue", f"{__file__}:Hose"], "has no effect called 'Hose'"),
         ([HIDDEN[0], "--robot", "emps"], "has 2 joints, but the robot emps has 1"),
-        ([HIDDEN[0], "--json", "absent/story.json"], "there is no folder absent"),
-        ([HIDDEN[0], "--report", "absent/story.html"], "there is no folder absent"),
-        ([HIDDEN[0], "--column", "q"], "has no '='"),
-        ([HIDDEN[0], "--unit", "q=parsec"], "is not a unit known for q"),
-        ([HIDDEN[0], "--controller", "fuzzy"], "there is no controller 'fuzzy'"),
+        ([HIDDEN[0], *SCARA, "--json", "absent/story.json"], "there is no folder absent"),
+        ([HIDDEN[0], *SCARA, "--report", "absent/story.html"], "there is no folder absent"),
+        ([HIDDEN[0], *SCARA, "--column", "q"], "has no '='"),
+        ([HIDDEN[0], *SCARA, "--unit", "q=parsec"], "is not a unit known for q"),
+        ([HIDDEN[0], *SCARA, "--controller", "fuzzy"], "there is no controller 'fuzzy'"),
     ],
 )
 def test_a_users_error_is_one_sentence(
@@ -278,7 +284,7 @@ def _interrupted(monkeypatch: pytest.MonkeyPatch, after: int, *options: str) -> 
         raise KeyboardInterrupt
 
     monkeypatch.setattr(jaxid.discovery, "discover", stop)
-    result = CliRunner().invoke(app, ["discover", HIDDEN[0], *options])
+    result = CliRunner().invoke(app, ["discover", HIDDEN[0], *SCARA, *options])
     assert result.exit_code == 130
     assert "Traceback" not in result.stderr
     return result
@@ -305,4 +311,4 @@ def test_an_interrupt_keeps_the_steps_and_says_how_to_go_on(
 def test_help_shows_examples() -> None:
     result = CliRunner().invoke(app, ["discover", "--help"])
     assert result.exit_code == 0
-    assert "jaxid discover fit_1.csv fit_2.csv --validate held_out.csv" in result.stdout
+    assert "jaxid discover fit_1.csv fit_2.csv --validate held_out.csv --robot" in result.stdout

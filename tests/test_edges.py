@@ -205,7 +205,7 @@ def test_light_and_heavy_robots_are_fitted_alike(
 
 
 def test_friction_as_steep_as_a_step(case: Any, plain: jaxid.Fit) -> None:
-    loop = jaxid.scara().with_values(gamma1=1e5, gamma2=1e5)
+    loop = jaxid.scara().with_values(eps1=1e-5, eps2=1e-5)
     fit = jaxid.fit(loop, pair(case), QUIET)
     assert fit.succeeded
     sound(fit)

@@ -23,7 +23,7 @@ REACH = jaxid.PlanarReach((0.3, 0.2), low=(-0.2, -0.45), high=(0.6, 0.45))
 def loop(**more):
     law = jaxid.control.PD(Kp=[200.0, 200.0], Kv=[25.0, 25.0], Kg=[0.5, 0.2])
     found = jaxid.two_link(law).with_values(**TRUTH | more)
-    return found.hold(gamma1=20.0, gamma2=20.0)
+    return found.hold(eps1=0.05, eps2=0.05)
 
 
 def limits(**more):

@@ -237,7 +237,7 @@ def test_regressions_say_what_they_cannot_see(cases):
         with pytest.raises(FitError, match="no free parameter to estimate"):
             jaxid.fit(held, one, method)
     with pytest.raises(FitError, match="no free parameter in which torque is linear"):
-        jaxid.fit(held.free("gamma1"), one, jaxid.IDIM())
+        jaxid.fit(held.free("eps1"), one, jaxid.IDIM())
 
 
 def test_a_regression_says_which_values_are_outside_their_bounds(cases):

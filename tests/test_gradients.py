@@ -139,7 +139,7 @@ def table1():
     loop = jaxid.scara().with_values(
         ZZ1r=3.44, ZZ2=0.06, MX2=0.24, MY2=0.01, Fv1=0.07, Fc1=0.23, Fv2=0.003, Fc2=0.05
     )
-    return loop.free("gamma1", "gamma2")
+    return loop.free("eps1", "eps2")
 
 
 def two_link(link_length=None):
@@ -154,7 +154,7 @@ def two_link(link_length=None):
 
 def emps(controller=None):
     """The EMPS axis, its friction soft enough for a step of 30 microseconds."""
-    return jaxid.emps(controller).with_values(M=95.1, Fv1=203.5, Fc1=20.4, gamma1=500.0)
+    return jaxid.emps(controller).with_values(M=95.1, Fv1=203.5, Fc1=20.4, eps1=0.002)
 
 
 def one_joint(controller=None, *more):

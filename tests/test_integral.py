@@ -50,7 +50,7 @@ def smooth():
 
 def loop():
     law = jaxid.control.PD(Kp=GAINS["Kp"], Kv=GAINS["Kv"], Kg=GAINS["Kg"])
-    return jaxid.two_link(law).hold(gamma1=20.0, gamma2=20.0)
+    return jaxid.two_link(law).hold(eps1=0.05, eps2=0.05)
 
 
 def recording(rows, q=None, resolution=None, part=slice(None)):

@@ -70,24 +70,24 @@ def test_a_joint_has_one_transmission():
 
 def test_what_is_held_stays_so_under_another_name():
     ripples = TorqueRipple(joint=1, harmonic=3.0), TorqueRipple(joint=1, harmonic=7.0)
-    loop = jaxid.scara().add(*ripples).hold("n1_2", "ZZ2").free("n1", "gamma2")
+    loop = jaxid.scara().add(*ripples).hold("n1_2", "ZZ2").free("n1", "eps2")
     less = loop.with_effects(e for e in loop.effects if e is not ripples[0])
     assert less.held_names == {"n1", "ZZ2"}
-    assert less.freed_names == {"gamma2"}
+    assert less.freed_names == {"eps2"}
     assert loop.without("torque_ripple").held_names == {"ZZ2"}
     turned = loop.with_effects(reversed(loop.effects))
     assert turned.held_names == {"n1", "ZZ2"}
-    assert turned.freed_names == {"n1_2", "gamma2"}
+    assert turned.freed_names == {"n1_2", "eps2"}
 
 
 def test_what_is_held_and_what_it_is_called_stays_as_effects_are_added():
-    loop = jaxid.scara().hold("Fc1", Fv2=0.01).free("gamma2")
+    loop = jaxid.scara().hold("Fc1", Fv2=0.01).free("eps2")
     more = loop.add(Coulomb(joint=1), Viscous(joint=2), TorqueRipple(joint=1, harmonic=3.0))
     assert [p.name for p in more.parameters][: len(loop.parameters)] == [
         p.name for p in loop.parameters
     ]
     assert (more.held, more.freed) == (loop.held, loop.freed)
-    assert (more.held_names, more.freed_names) == ({"Fc1", "Fv2"}, {"gamma2"})
+    assert (more.held_names, more.freed_names) == ({"Fc1", "Fv2"}, {"eps2"})
     assert {"Fc1_2", "Fv2_2"} <= set(more.names)
     # One effect twice is two: each keeps what is its own.
     twice = Viscous(joint=1)
@@ -155,19 +155,19 @@ def test_hold_and_free():
     np.testing.assert_array_equal(held.with_theta(held.theta + 1).arm.MX2, 0.3)
     assert held.free("MX2", "ZZ2").names == loop.names
     # What is not free by declaration can be freed, and held again.
-    freed = loop.free("gamma2")
-    assert freed.names == (*loop.names, "gamma2")
-    assert freed.hold("gamma2").names == loop.names
-    assert loop.hold(gamma1=50.0).names == loop.names
+    freed = loop.free("eps2")
+    assert freed.names == (*loop.names, "eps2")
+    assert freed.hold("eps2").names == loop.names
+    assert loop.hold(eps1=0.02).names == loop.names
     for wrong in (lambda: loop.hold("ZZ3"), lambda: loop.hold(ZZ3=1.0), lambda: loop.free("ZZ3")):
         with pytest.raises(ModelError, match="no parameter 'ZZ3' in this model: it has ZZ1r, ZZ2"):
             wrong()
 
 
 def test_with_values_and_repr():
-    loop = jaxid.scara().with_values(ZZ1r=3.25, gamma2=70.0)
+    loop = jaxid.scara().with_values(ZZ1r=3.25, eps2=0.014)
     assert float(loop.arm.ZZ1r) == 3.25
-    assert float(loop.effects[3].gamma) == 70.0
+    assert float(loop.effects[3].smoothing) == 0.014
     with pytest.raises(ModelError, match="no parameter 'mass' in this model: it has ZZ1r"):
         loop.with_values(mass=1.0)
     text = repr(loop)

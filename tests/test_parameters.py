@@ -59,7 +59,7 @@ class Box(eqx.Module):
 def test_names_are_symbols_with_the_joint_in_the_order_of_the_fields():
     names = [p.name for p in jaxid.scara().parameters]
     arm = ["ZZ1r", "ZZ2", "MX2", "MY2"]
-    assert names == [*arm, "Fv1", "Fc1", "gamma1", "Fv2", "Fc2", "gamma2"]
+    assert names == [*arm, "Fv1", "Fc1", "eps1", "Fv2", "Fc2", "eps2"]
     assert jaxid.scara().names == (*arm, "Fv1", "Fc1", "Fv2", "Fc2")
     assert [p.joint for p in jaxid.scara().parameters][3:6] == [None, 1, 1]
 
@@ -103,9 +103,9 @@ def test_parameter_that_is_none_is_not_there():
 def test_declaration_is_what_the_field_says():
     (pull,) = list_parameters(Tilt(pull=1.0))
     assert pull.declaration == Declaration("pull", "m/s²", -math.inf, math.inf, 9.81, True, True)
-    gamma = next(p for p in list_parameters(Coulomb(joint=1)) if p.name == "gamma1")
-    assert (gamma.declaration.free, gamma.declaration.linear) == (False, False)
-    assert (gamma.declaration.lower, gamma.declaration.scale) == (0.0, 100.0)
+    eps = next(p for p in list_parameters(Coulomb(joint=1)) if p.name == "eps1")
+    assert (eps.declaration.free, eps.declaration.linear) == (False, False)
+    assert (eps.declaration.lower, eps.declaration.scale) == (0.0, 0.01)
 
 
 @pytest.mark.parametrize("given_value", [2, 2.0, np.float32(2.0), np.array(2), jnp.array(2.0)])
@@ -135,7 +135,7 @@ def test_units_of_joints_that_slide():
     assert sliding_unit("N·m/(rad/s)") == "N/(m/s)"
     loop = jaxid.emps()
     units = {p.name: loop.unit(p) for p in loop.parameters}
-    assert units == {"M": "kg", "Fv1": "N·s/m", "Fc1": "N", "gamma1": "s/m", "offset1": "N"}
+    assert units == {"M": "kg", "Fv1": "N·s/m", "Fc1": "N", "eps1": "m/s", "offset1": "N"}
     assert jaxid.scara().unit(jaxid.scara().parameters[4]) == "N·m·s/rad"
 
 
@@ -186,9 +186,9 @@ def test_writing_is_differentiable_and_touches_nothing_else():
     loop = jaxid.scara()
     matrix = jax.jacfwd(lambda theta: loop.with_theta(2 * theta).theta)(loop.theta)
     np.testing.assert_array_equal(matrix, 2 * np.eye(len(loop.theta)))
-    gamma = [p for p in loop.parameters if p.name == "gamma1"]
+    eps = [p for p in loop.parameters if p.name == "eps1"]
     written = loop.with_theta(loop.theta + 1)
-    np.testing.assert_array_equal(read_values(written, gamma), read_values(loop, gamma))
+    np.testing.assert_array_equal(read_values(written, eps), read_values(loop, eps))
 
 
 def test_setting_by_name():

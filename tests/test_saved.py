@@ -105,7 +105,7 @@ def test_loops_of_every_class_come_back() -> None:
     )
     loops = [jaxid.scara(c).add(*effects, jaxid.effects.Payload()) for c in controllers]
     loops += [jaxid.two_link(), jaxid.two_link(link_length=0.3)]
-    loops += [jaxid.emps(jaxid.control.Cascade(delay=True)).hold("M").free("gamma1")]
+    loops += [jaxid.emps(jaxid.control.Cascade(delay=True)).hold("M").free("eps1")]
     loops += [dataclasses.replace(jaxid.emps(), resolution=(1e-6,))]
     for loop in loops:
         same(loop, again(loop))
@@ -168,8 +168,8 @@ def test_the_first_format_stays_readable() -> None:
     fit = jaxid.load(FIRST_FORMAT)
     assert fit.loop.names == ("M", "Fv1", "Fc1", "offset1")
     # It held the name.
-    assert fit.loop.held == {("effects", 1, "gamma")}
-    assert fit.loop.held_names == {"gamma1"}
+    assert fit.loop.held == {("effects", 1, "smoothing")}
+    assert fit.loop.held_names == {"eps1"}
     assert fit.status is jaxid.Status.converged
     assert fit.theta == pytest.approx([99.26, 221.1, 6.454, 0.652], rel=1e-3)
     assert jaxid.compare(fit, fit.recordings).errors.shape == (3, 1)

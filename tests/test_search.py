@@ -165,14 +165,14 @@ def test_a_search_that_may_add_nothing_says_that_something_is_left(offset_case):
 
 
 def test_effects_share_the_sharpness_that_is_estimated_for_their_joint():
-    worn = Stribeck(1, 0.0, 0.02, gamma=5.0)
-    loop = jaxid.emps().with_values(gamma1=1.2e4).add(worn)
-    assert float(of_one_sign(loop).effects[-1].gamma) == 1.2e4
+    worn = Stribeck(1, 0.0, 0.02, smoothing=0.2)
+    loop = jaxid.emps().with_values(eps1=8e-5).add(worn)
+    assert float(of_one_sign(loop).effects[-1].smoothing) == 8e-5
     # What a user has freed, or never asked to estimate, is the user's.
-    freed = loop.free("gamma1_2")
-    assert float(of_one_sign(freed).effects[-1].gamma) == 5.0
+    freed = loop.free("eps1_2")
+    assert float(of_one_sign(freed).effects[-1].smoothing) == 0.2
     held = jaxid.scara().add(worn)
-    assert float(of_one_sign(held).effects[-1].gamma) == 5.0
+    assert float(of_one_sign(held).effects[-1].smoothing) == 0.2
 
 
 @pytest.mark.slow

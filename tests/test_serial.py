@@ -210,7 +210,7 @@ def test_a_cylinder_pulls_as_its_points_say():
 
 
 def test_a_shaft_loads_both_joints_with_one_power():
-    effect = SharedShaft(1, 2, viscous=0.5, coulomb=0.2, inertia=0.1, share=2.0, gamma=1e6)
+    effect = SharedShaft(1, 2, viscous=0.5, coulomb=0.2, inertia=0.1, share=2.0, smoothing=1e-6)
     motion = motion_of(q=[0.0, 0.0], v=[0.3, -0.1], a=[1.0, 2.0])
     on_shaft = 0.5 * 0.5 + 0.2 + 0.1 * 4.0
     np.testing.assert_allclose(effect.torque(motion), [2 * on_shaft, on_shaft], rtol=1e-5)

@@ -54,7 +54,7 @@ def cubic(t):
 
 def loop(law=None, drag=DRAG, **stepping):
     """The axis under its law."""
-    friction = Viscous(1, drag), Coulomb(1, DRY, gamma=SHARP)
+    friction = Viscous(1, drag), Coulomb(1, DRY, smoothing=1 / SHARP)
     settings = jaxid.Stepping(**stepping)
     return jaxid.ClosedLoop(Axis(M=MASS), law or PD(**GAINS), friction, stepping=settings)
 

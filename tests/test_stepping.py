@@ -143,8 +143,8 @@ def test_default_steps_are_fine_enough_for_the_emps():
 
 def test_more_steps_where_the_loop_is_quicker(lengths):
     slow, recordings = jaxid.scara().with_values(**SCARA_VALUES), jaxid.Recordings.of(lengths)
-    quick = slow.with_values(gamma2=5000.0)
-    # Coulomb friction at standstill: Fc 2/pi gamma over the inertia that joint 2 has on its own.
+    quick = slow.with_values(eps2=2e-4)
+    # Coulomb friction at standstill: 2/pi Fc/eps over the inertia that joint 2 has on its own.
     lowest = 0.05 * 2 / math.pi * 5000 / 0.06
     assert lowest < fastest_rate(quick, recordings) < 2 * lowest
     assert with_substeps(slow, recordings).stepping.substeps == 4
@@ -156,7 +156,7 @@ def test_more_steps_where_the_loop_is_quicker(lengths):
     implicit = dataclasses.replace(quick, stepping=jaxid.Stepping(solver=diffrax.Kvaerno3()))
     assert with_substeps(implicit, recordings).stepping.substeps == 4
     with pytest.raises(ModelError, match="more than 10000"):
-        with_substeps(quick.with_values(gamma2=1e7), recordings)
+        with_substeps(quick.with_values(eps2=1e-7), recordings)
     chosen = dataclasses.replace(slow, stepping=jaxid.Stepping(substeps=3))
     assert with_substeps(chosen, recordings).stepping.substeps == 3
 

@@ -7,6 +7,7 @@ import typer
 from .discovering import Spread, demo, discover
 from .ending import INTERRUPTED, leave, leave_on_interrupt
 from .fitting import compare, fit
+from .inspecting import diagnose, inspect
 
 ABOUT = """Identify robot arms from closed-loop recordings, and find the effect the model lacks.
 
@@ -14,8 +15,9 @@ ABOUT = """Identify robot arms from closed-loop recordings, and find the effect 
 Examples:
   jaxid demo
   jaxid fit run_1.csv run_2.csv --robot scara --json fit.json
-  jaxid compare held_out.csv --fit fit.json --plot compare.html
-  jaxid discover run_1.csv run_2.csv --validate held_out.csv --report story.html
+  jaxid inspect run_1.csv --write log.toml
+  jaxid compare held_out.csv --robot scara --fit fit.json --plot compare.html
+  jaxid discover run_1.csv run_2.csv --validate held_out.csv --robot arm.urdf --report story.html
 
 \b
 Exit codes:
@@ -37,8 +39,10 @@ app = typer.Typer(
 )
 
 # In the order in which the help lists them.
+app.command()(inspect)
 app.command()(fit)
 app.command()(compare)
+app.command()(diagnose)
 app.command(cls=Spread)(discover)
 app.command()(demo)
 

@@ -13,9 +13,23 @@ from typer.core import TyperCommand
 
 from ..errors import RecordingError
 from .ending import UNDETERMINED, sentences
-from .files import check_outputs, read_files, write_json
+from .files import Reading, check_outputs, write_json
 from .models import load_effect, load_robot, with_controller, without
-from .options import Catalogue, Column, Controller, Files, Json, Quiet, Report, Robot, Unit
+from .options import (
+    Catalogue,
+    Clock,
+    Column,
+    Controller,
+    DropNan,
+    Files,
+    Gaps,
+    Json,
+    Log,
+    Quiet,
+    Report,
+    Robot,
+    Unit,
+)
 from .showing import LEGEND, error_falls, say, tell
 
 
@@ -66,7 +80,7 @@ def discover(
         list[Path] | None,
         typer.Option(help="Recordings held out of the fit, to judge by: one or several."),
     ] = None,
-    robot: Robot = "scara",
+    robot: Robot = None,
     json_file: Json = None,
     report: Report = None,
     resume: Annotated[
@@ -86,6 +100,10 @@ def discover(
     ] = 0.05,
     column: Column = None,
     unit: Unit = None,
+    log: Log = None,
+    gaps: Gaps = "refuse",
+    clock: Clock = "recorded",
+    drop_nan: DropNan = False,
     controller: Controller = None,
     quiet: Quiet = False,
 ) -> None:
@@ -97,10 +115,10 @@ def discover(
 
     \b
     Examples:
-      jaxid discover fit_1.csv fit_2.csv --validate held_out.csv
+      jaxid discover fit_1.csv fit_2.csv --validate held_out.csv --robot arm.urdf
       jaxid discover run_*.csv --validate held_1.csv held_2.csv --robot my_robot.py:loop \\
             --unit q=deg --json story.json --report story.html --resume steps
-      jaxid discover run_*.csv --catalogue my_effects.py:Hose --save story.jaxid
+      jaxid discover run_*.csv --robot arm.urdf --catalogue my_effects.py:Hose --save story.jaxid
     """
     from ..discovery import discover as run_discover
     from ..effects import catalogue as known
@@ -111,13 +129,14 @@ def discover(
     with journal, sentences(journal.farewell):
         check_outputs(json_file, report, save)
         loop = with_controller(load_robot(robot), controller)
+        reading = Reading(column, unit, log, gaps, clock, drop_nan)
         own = [load_effect(given) for given in catalogue or ()]
         held_out = list(validate or [])
         _check_apart(files, held_out)
         story = run_discover(
             loop,
-            read_files(files, column, unit),
-            validate=read_files(held_out, column, unit) if held_out else None,
+            reading(files),
+            validate=reading(held_out) if held_out else None,
             catalogue=(*without(known, exclude or ()), *own),
             worth=worth,
             resume=journal.path,

@@ -2,19 +2,70 @@
 
 import json
 import math
+import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import ModelError
+import equinox as eqx
+
+from ..errors import ModelError, near
 
 
-def read_files(files: list[Path], column: list[str] | None, unit: list[str] | None) -> Any:
-    """The recordings in files, read as the options `--column` and `--unit` say."""
-    from ..recording import read
+class Reading(eqx.Module):
+    """How files are read: the options that say what is in them."""
 
-    named = _pairs(column, "column")
-    columns = {k: v if k == "time" else v.split(",") for k, v in named.items()} if named else None
-    return read(*files, columns=columns, units=_pairs(unit, "unit"))
+    column: list[str] | None = None
+    unit: list[str] | None = None
+    log: Path | None = None
+    gaps: str = "refuse"
+    clock: str = "recorded"
+    drop_nan: bool = False
+
+    def __call__(self, files: Sequence[Path]) -> Any:
+        """The recordings in files.
+
+        **Raises:** `RecordingError` or `ModelError` for what cannot be read.
+        """
+        from ..recording import read
+
+        told = {} if self.log is None else described(self.log)
+        columns = told.get("columns", {}) | _several(_pairs(self.column, "column"))
+        units = told.get("units", {}) | _several(_pairs(self.unit, "unit"))
+        gaps: Any = self.gaps if self.gaps != "refuse" else told.get("gaps", "refuse")
+        clock: Any = self.clock if self.clock != "recorded" else told.get("clock", "recorded")
+        nan = "drop" if self.drop_nan else told.get("nan", "refuse")
+        return read(
+            *files, columns=columns or None, units=units or None, gaps=gaps, nan=nan, clock=clock
+        )
+
+
+def described(path: Path) -> dict[str, Any]:
+    """What a TOML file says of logs: `[columns]`, `[units]`, and `gaps`, `nan`, `clock`.
+
+    **Raises:** `ModelError` for a file that says something else.
+    """
+    known = {"columns": dict, "units": dict, "gaps": str, "nan": str, "clock": str}
+    try:
+        told = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ModelError(f"there is no file {path}: jaxid inspect --write makes one") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ModelError(f"{path} is no TOML ({error}): mend that line") from error
+    for key, value in told.items():
+        if not isinstance(value, known.get(key, ())):
+            raise ModelError(
+                f"{path} has {key!r}{near(key, known)}: give tables [columns] and [units], and "
+                'gaps = "allow", nan = "drop" or clock = "even"'
+            )
+    return told
+
+
+def _several(named: dict[str, str] | None) -> dict[str, Any]:
+    """Values that name one thing for each joint, taken apart."""
+    return {
+        name: value.split(",") if "," in value else value for name, value in (named or {}).items()
+    }
 
 
 def _pairs(given: list[str] | None, what: str) -> dict[str, str] | None:

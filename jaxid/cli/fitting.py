@@ -7,18 +7,36 @@ import typer
 
 from ..errors import ModelError
 from .ending import sentences
-from .files import check_outputs, read_files, write_json
-from .models import load_effect, load_robot, with_controller, with_fitted
-from .options import METHODS, Column, Controller, Files, Json, Quiet, Robot, Unit, Window
+from .files import Reading, check_outputs, write_json
+from .models import load_effect, load_robot, saved_model, with_controller
+from .options import (
+    METHODS,
+    Clock,
+    Column,
+    Controller,
+    DropNan,
+    Files,
+    Gaps,
+    Json,
+    Log,
+    Quiet,
+    Robot,
+    Unit,
+    Window,
+)
 from .showing import pooled
 
 
 def fit(
     files: Files,
-    robot: Robot = "scara",
+    robot: Robot = None,
     json_file: Json = None,
     column: Column = None,
     unit: Unit = None,
+    log: Log = None,
+    gaps: Gaps = "refuse",
+    clock: Clock = "recorded",
+    drop_nan: DropNan = False,
     controller: Controller = None,
     method: Annotated[str, typer.Option(help=METHODS)] = "oem",
     window: Window = None,
@@ -55,7 +73,8 @@ def fit(
         if window is not None and method not in ("oem", "pem"):
             raise ModelError(f"--method {method} simulates nothing in windows: leave out --window")
         loop = with_controller(load_robot(robot), controller)
-        found = estimate.fit(loop, read_files(files, column, unit), methods[method]())
+        reading = Reading(column, unit, log, gaps, clock, drop_nan)
+        found = estimate.fit(loop, reading(files), methods[method]())
         typer.echo(repr(found).partition("\n")[0] if quiet else repr(found))
         write_json(json_file, found.to_dict())
         if not found.succeeded:
@@ -64,10 +83,14 @@ def fit(
 
 def compare(
     files: Files,
-    robot: Robot = "scara",
+    robot: Robot = None,
     json_file: Json = None,
     column: Column = None,
     unit: Unit = None,
+    log: Log = None,
+    gaps: Gaps = "refuse",
+    clock: Clock = "recorded",
+    drop_nan: DropNan = False,
     controller: Controller = None,
     values: Annotated[
         Path | None,
@@ -87,7 +110,7 @@ def compare(
 
     \b
     Examples:
-      jaxid compare held_out.csv --fit fit.json --plot compare.html
+      jaxid compare held_out.csv --robot scara --fit fit.json --plot compare.html
       jaxid compare new.csv --fit story.jaxid
       jaxid compare run.csv --robot my_robot.py:loop --json errors.json
 
@@ -97,12 +120,11 @@ def compare(
 
     with sentences():
         check_outputs(json_file, plot)
-        loop = load_robot(robot)
-        if values is not None:
-            own = frozenset(e for e in map(load_effect, catalogue or ()) if isinstance(e, type))
-            loop = with_fitted(loop, values, own)
+        own = frozenset(e for e in map(load_effect, catalogue or ()) if isinstance(e, type))
+        loop = saved_model(robot, values, own)
         loop = with_controller(loop, controller)
-        result = run_compare(loop, read_files(files, column, unit), window=window)
+        reading = Reading(column, unit, log, gaps, clock, drop_nan)
+        result = run_compare(loop, reading(files), window=window)
         errors = ", ".join(f"{name} {x:.3f} %" for name, x in pooled(result).items())
         typer.echo(f"{result.loop.name}: {errors}" if quiet else repr(result))
         write_json(json_file, result.to_dict())

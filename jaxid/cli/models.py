@@ -10,13 +10,13 @@ from typing import Any
 from ..errors import ModelError
 
 
-def load_robot(robot: str) -> Any:
+def load_robot(robot: str | None) -> Any:
     """A loop by the name of a ready robot, or from a Python file.
 
     **Arguments:**
 
     - `robot`: `scara`, `two-link`, `emps`, a URDF file, or `path/to/file.py:name` of a loop, or of
-      a function without arguments that gives one.
+      a function without arguments that gives one; None where the user named none.
 
     **Raises:** `ModelError` that says what was not found.
     """
@@ -24,6 +24,11 @@ def load_robot(robot: str) -> Any:
     from ..simulation.loop import ClosedLoop
 
     ready = {"scara": robots.scara, "two-link": robots.two_link, "emps": robots.emps}
+    if robot is None:
+        raise ModelError(
+            "no robot is named: give --robot FILE.urdf, --robot FILE.py:NAME of a loop of your "
+            f"own, or one of {', '.join(ready)}"
+        )
     if robot in ready:
         return ready[robot]()
     if robot.lower().endswith(".urdf"):
@@ -104,16 +109,27 @@ def with_controller(loop: Any, controller: str | None) -> Any:
     return dataclasses.replace(loop, controller=laws[controller]())
 
 
-def with_fitted(loop: Any, path: Path, own: frozenset[type] = frozenset()) -> Any:
-    """The loop at the values, or instead of it the model, that an earlier command wrote."""
+def saved_model(robot: str | None, path: Path | None, own: frozenset[type] = frozenset()) -> Any:
+    """The robot, at the values, or instead of it the model, that an earlier command wrote.
+
+    **Arguments:**
+
+    - `robot`: as for `load_robot`; a saved model needs none, unless its classes are the robot's.
+    - `path`: what was written; None for the robot as it is.
+    - `own`: further classes of the user's.
+    """
+    if path is None:
+        return load_robot(robot)
     if path.suffix == ".jaxid":
         from ..storage.classes import classes_of
         from ..storage.saved import load
 
-        saved = load(path, classes_of(loop) | own)
+        theirs = frozenset() if robot is None else classes_of(load_robot(robot))
+        saved = load(path, theirs | own)
         if not hasattr(saved, "loop"):
             raise ModelError(f"{path} holds no model: give a saved fit or story")
         return saved.loop
+    loop = load_robot(robot)
     try:
         parameters = json.loads(path.read_text(encoding="utf-8"))["parameters"]
         found = {name: float(entry["value"]) for name, entry in parameters.items()}

@@ -10,8 +10,10 @@ Files = Annotated[
     typer.Argument(help="Recordings: .csv, .tsv, .txt, .parquet, .mat or .npz, also .gz."),
 ]
 Robot = Annotated[
-    str,
-    typer.Option(help="scara, two-link, emps, FILE.urdf, or FILE.py:NAME for a loop of your own."),
+    str | None,
+    typer.Option(
+        help="FILE.urdf, FILE.py:NAME of a loop of your own, scara, two-link or emps; required."
+    ),
 ]
 Json = Annotated[Path | None, typer.Option("--json", help="Also write the result here.")]
 Column = Annotated[
@@ -19,7 +21,21 @@ Column = Annotated[
     typer.Option("--column", help="Our name=theirs, as q=pos_1,pos_2; once for each signal."),
 ]
 Unit = Annotated[
-    list[str] | None, typer.Option("--unit", help="Unit of a signal that is not SI, as q=deg.")
+    list[str] | None,
+    typer.Option(
+        "--unit", help="Unit of a signal that is not SI, as q=deg, or one per joint: q=deg,mm."
+    ),
+]
+Log = Annotated[
+    Path | None,
+    typer.Option("--log", help="Columns and units in a TOML file, as jaxid inspect --write does."),
+]
+Gaps = Annotated[
+    str, typer.Option(help="refuse or allow: missing stretches of time in a recording.")
+]
+Clock = Annotated[str, typer.Option(help="recorded, or even where the times of a logger jitter.")]
+DropNan = Annotated[
+    bool, typer.Option("--drop-nan", help="Leave out samples at which a signal is empty.")
 ]
 METHODS = "oem, pem, idim, idim-iv, didim, integral, filtered, fourier or difference."
 Controller = Annotated[

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..errors import ModelError
 from ..recording import Recording
@@ -96,6 +96,17 @@ class AbstractController(eqx.Module):
 
         Where it is given, both pass the same low-pass first, the ends of a recording do not count,
         and the loop starts on its reference.
+        """
+        return None
+
+    def moving(
+        self, recording: Recording, cutoff: float
+    ) -> Bool[np.ndarray, "samples joints"] | None:
+        """At which samples a joint's torque may be compared; None for all.
+
+        **Arguments:**
+
+        - `cutoff`: up to which measured and simulated torque are compared, Hz.
         """
         return None
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..recording import Recording
 from ..signals.smoothing import even_times, resampled, signal_cutoff, smooth_motion
@@ -34,12 +34,16 @@ class Tracking(AbstractController):
       a law that is computed as often as it is recorded, and held in between.
     - `cutoff`: of the low-pass, Hz; by default where the recorded motion's spectrum sinks into
       noise, and once fitted the lowest of these.
+    - `still`: share of its highest speed below which a joint stands still. Friction holds it then
+      with any torque up to that of breaking away, which no motion tells, so neither then nor within
+      half a period of the cutoff is its torque compared; nil compares it all.
     """
 
     bandwidth: float = 40.0
     damping: float = 1.0
     cutoff: float | None = eqx.field(static=True, default=None)
     delay: float = eqx.field(static=True, default=0.0)
+    still: float = eqx.field(static=True, default=0.01)
 
     @property
     def pace(self) -> float:
@@ -66,6 +70,24 @@ class Tracking(AbstractController):
     def comparable(self, recording: Recording) -> float:
         """The low-pass's cutoff, Hz."""
         return self.cutoff or signal_cutoff(recording)
+
+    def moving(
+        self, recording: Recording, cutoff: float
+    ) -> Bool[np.ndarray, "samples joints"] | None:
+        """At which samples a joint moves, and has moved for as long as the low-pass remembers."""
+        import scipy
+
+        if self.still <= 0:
+            return None
+        time = even_times(recording)
+        speed = np.gradient(smooth_motion(recording, cutoff), time, axis=0)
+        standing = np.abs(speed) < self.still * np.abs(speed).max(axis=0)
+        # Fast turns are over between two samples.
+        turns = speed[1:] * speed[:-1] < 0
+        standing[1:] |= turns
+        standing[:-1] |= turns
+        half = max(1, round(recording.rate / cutoff / 2))
+        return ~scipy.ndimage.binary_dilation(standing, np.ones((2 * half + 1, 1), bool))
 
     def settled(self, recordings: Iterable[Recording]) -> "Tracking":
         """With one cutoff for all: the lowest up to which any of their motions is known."""

@@ -61,7 +61,8 @@ class Comparison(AbstractShown):
     def judged(self, recording: int | str = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Time, measured and simulated signal as they are compared, `(samples, joints)`.
 
-        Where the controller is made up, both have passed its low-pass and lost their ends.
+        Where the controller is made up, both have passed its low-pass and lost their ends, and are
+        zero where a joint stands still.
 
         **Arguments:**
 
@@ -115,6 +116,9 @@ class Comparison(AbstractShown):
 
         k = self._index(recording)
         time, measured, simulated = self.judged(k)
+        # Where a joint stands still there is nothing to compare, and no line to draw.
+        blank = np.where((measured == 0) & (simulated == 0), np.nan, 0.0)
+        measured, simulated = measured + blank, simulated + blank
         acf, bound = self.autocorrelation(k)
         torque, position = self.loop.arm.units()
         units = position if self.signal == "position" else torque

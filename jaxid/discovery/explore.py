@@ -69,7 +69,6 @@ def explore(
     landscape: Landscape,
     most: int,
     say: Callable[[str], None],
-    there: Sequence[AbstractEffect] = (),
 ) -> list[Candidate]:
     """All sets that were looked at, best first.
 
@@ -79,14 +78,14 @@ def explore(
 
     **Arguments:**
 
-    - `most`: effects of a set at the most. `there`: those that the fitted model has already.
+    - `most`: effects of a set at the most.
     """
     nothing = _candidate(landscape, landscape.predictor.predict(()))
     seen: dict[tuple, Candidate] = {nothing.key: nothing}
     opened: set[tuple] = set()
     while (at := _next(seen, opened)) is not None:
         opened.add(at.key)
-        for effects in _moves(landscape, seen, at, most, there):
+        for effects in _moves(landscape, seen, at, most):
             if key_of(effects) in seen or shares_a_joint(effects):
                 continue
             say(f"set {len(seen)}: {', '.join(e.effect_name() for e in effects)}")
@@ -165,9 +164,8 @@ def _moves(
     seen: dict[tuple, Candidate],
     at: Candidate,
     most: int,
-    there: Sequence[AbstractEffect],
 ) -> Iterator[tuple[AbstractEffect, ...]]:
-    had = Counter(form(e)[:2] for e in (*there, *at.effects))
+    had = Counter(form(e)[:2] for e in (*landscape.predictor.system.loop.effects, *at.effects))
     if len(at.effects) < most:
         entries = _plain(landscape.beside(at.prediction), had)
         best = entries[0].evidence if entries else 0.0
@@ -199,11 +197,16 @@ def _moves(
 
 
 def _plain(entries: Sequence[Entry], had: Counter) -> list[Entry]:
-    """Entries of the catalogue; what is there twice already is not added again.
+    """Entries of the catalogue; none that is there as often as a joint may have it.
 
-    Two ends of a travel, two harmonics of a ripple: three of a kind come close to something else.
+    Two ends of a travel, two harmonics of a ripple: three of a kind come close to something else,
+    and so do two of other kinds.
     """
-    return [e for e in entries if not isinstance(e.effect, Curve) and had[form(e.effect)[:2]] < 2]
+    return [
+        e
+        for e in entries
+        if not isinstance(e.effect, Curve) and had[form(e.effect)[:2]] < 1 + e.effect.several
+    ]
 
 
 def _with_curves(landscape: Landscape, at: Candidate) -> list[Candidate]:

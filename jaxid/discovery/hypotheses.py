@@ -77,7 +77,7 @@ def survey(
     mass = np.asarray(jax.vmap(loop.arm.mass_matrix)(jnp.asarray(q[:: max(1, len(q) // 64)])))
     # Rotors are effects: without them drawn bodies may leave a wrist next to none.
     mass = mass + 1e-6 * np.trace(mass, axis1=1, axis2=2)[:, None, None] * np.eye(loop.joints)
-    sharp = {e.joint: float(e.gamma) for e in loop.effects if isinstance(e, Coulomb)}
+    smoothed = {e.joint: float(e.smoothing) for e in loop.effects if isinstance(e, Coulomb)}
     return Scene(
         low,
         # A joint that is held still has a travel all the same, which shapes can be a part of.
@@ -85,7 +85,7 @@ def survey(
         np.maximum(speed, 1e-6),
         np.abs(np.asarray(motion.tau)).reshape(-1, loop.joints).max(axis=0),
         1 / np.mean(np.diagonal(np.linalg.inv(mass), axis1=1, axis2=2), axis=0),
-        np.array([sharp.get(j, 100.0) for j in range(1, loop.joints + 1)]),
+        np.array([smoothed.get(j, 0.01) for j in range(1, loop.joints + 1)]),
         float(np.median([r.period for r in recordings])),
         float(max(r.duration for r in recordings)),
         tuple(recordings.names),
@@ -119,7 +119,7 @@ def curves(scene: Scene, motion: Motion, knots: int = 12) -> list[Curve]:
                         high=high,
                         signed=signed,
                         coefficients=jnp.zeros(knots),
-                        gamma=scene.sharpness(joint),
+                        smoothing=scene.smoothed(joint),
                     )
                 )
     return made

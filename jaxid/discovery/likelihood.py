@@ -54,14 +54,16 @@ def score_of(fit: Fit, size: int = 0, offered: int = 0) -> Score:
 
 
 def _scored(series: Sequence[Sequence[np.ndarray]], freedom: int, paid: float) -> Score:
-    total, value, noise = sum(len(s) for rows in series for s in rows), 0.0, []
+    # Rows at which a joint stands still are zero, and none that count.
+    total = sum(np.count_nonzero(s) for rows in series for s in rows)
+    value, noise = 0.0, []
     for rows in series:
         # A mean is the model's to explain, and not taken off.
         found = filter_of(rows, _HIGHEST)
-        size = np.array([len(s) for s in rows])
+        size = np.array([max(np.count_nonzero(s), 1) for s in rows])
         # Recordings have noise of levels of their own where that is worth its price.
-        power = np.array([np.mean(found.whiten(s)[found.order :] ** 2) for s in rows])
-        power = np.maximum(power, 1e-300)
+        power = np.array([np.sum(found.whiten(s)[found.order :] ** 2) for s in rows])
+        power = np.maximum(power / np.maximum(size - found.order, 1), 1e-300)
         mean = float(size @ power / size.sum())
         apart = float(size @ np.log(power)) + (len(rows) - 1) * math.log(total)
         value += min(size.sum() * math.log(mean), apart)

@@ -4,14 +4,43 @@ from collections.abc import Sequence
 
 from ..effects import ActuatorLag, TimeDelay
 from ..estimate import Fit
+from ..simulation.loop import ClosedLoop
 from .story import Step
 
 
-def remarks(steps: Sequence[Step]) -> tuple[str, ...]:
-    """Fits that did not converge, and a law that looks sampled and was not said to be."""
+def remarks(steps: Sequence[Step], given: ClosedLoop) -> tuple[str, ...]:
+    """Fits that did not converge, values released, a law that looks sampled and was not said to be.
+
+    **Arguments:**
+
+    - `given`: the loop that the discovery began with.
+    """
     bad = [s.label for s in steps if not s.fit.succeeded]
     said = [f"the fit of {', '.join(bad)} did not converge: read its values with care"]
-    return (*(said if bad else ()), *looks_sampled(steps[-1].fit))
+    last = steps[-1].fit
+    return (*(said if bad else ()), *_estimated(last, given), *looks_sampled(last))
+
+
+def _estimated(fit: Fit, given: ClosedLoop) -> list[str]:
+    """What to say of values that the model held by default and the search estimated."""
+    places = {p.place for p in given.free_parameters}
+    held = {p.place: p for p in given.parameters if p.place not in places}
+    found = []
+    for p in fit.loop.free_parameters:
+        if p.place in held:
+            before, row = float(held[p.place].where(given)), fit.table().loc[p.name]
+            found.append(
+                f"{p.name} was estimated, {row['value']:.3g} ± {row['std']:.2g} {row['unit']}: the "
+                f"model's {before:.3g}, a default, does not suit these recordings"
+            )
+    before, after = (getattr(x.controller, "delay", 0.0) for x in (given, fit.loop))
+    if after != before and fit.loop.controller.imposes:
+        way = "later" if after > 0 else "earlier"
+        found.append(
+            f"the recorded torque acts {1e3 * abs(after):.3g} ms {way} than it was recorded, as "
+            "estimated; a law that ticks and is held is half a period late"
+        )
+    return found
 
 
 # Shares of a sample by which the torque of a law is late that is computed as often as it is

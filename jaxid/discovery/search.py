@@ -7,15 +7,17 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 
 from ..control import OpenLoop
 from ..display.progress import working
 from ..effects import AbstractEffect
 from ..effects import catalogue as known
-from ..errors import FitError
+from ..errors import FitError, ModelError, RecordingError
 from ..estimate import OEM, Fit, Status
 from ..recording import Recording, Recordings
+from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
@@ -28,6 +30,7 @@ from .landscape import Landscape, form, forms_of
 from .likelihood import price, score_of
 from .models import Model, Named, Visited, named, probability, worth_keeping
 from .ranking import Screened, judge
+from .release import released
 from .remarks import remarks
 from .screening import screen
 from .story import Discovery, Step
@@ -88,6 +91,7 @@ def discover(
     recordings = Recordings.of(recordings)
     held_out = None if validate is None else Recordings.of(validate)
     Recordings.of([*recordings, *(held_out or ())]).common_period()
+    _check_apart(recordings, held_out or ())
     asked = Asked(
         recordings, held_out, method or OEM(), tuple(catalogue), significance, worth, most
     )
@@ -111,15 +115,19 @@ class Search:
         self.visited = Visited()
         self.forms = 0
         self.removed: tuple[Named, ...] = ()
+        self.failures: tuple[str, ...] = ()
         self.latest: tuple[Screened, Diagnosis] | None = None
         self.diagnoses: dict[tuple, Diagnosis] = {}
 
     def run(self, loop: ClosedLoop) -> tuple[Outcome, bool]:
         """Rounds of predicting and verifying, until nothing is better; the verdict follows."""
+        self.given = loop
         at = self._start(loop)
         while True:
             candidates, nothing = self._predicted(at)
-            better = self._verified(at, candidates, nothing)
+            better = self._released(at, candidates, nothing)
+            if better is None:
+                better = self._verified(at, candidates, nothing)
             if better is None and (better := self._without_one(at)) is not None:
                 gone = [n for n in at.names if n not in better.names]
                 self.removed = (*self.removed, *gone)
@@ -164,10 +172,37 @@ class Search:
         landscape = Landscape.of(screened.system, data, screened.hypotheses, diagnosis.noise)
         # At the most that was asked, one more is looked for, to say whether something is left.
         left = min(max(self.asked.most - len(at.effects), 1), _AHEAD)
-        candidates = explore(landscape, left, self.say, at.effects)
-        self.seen = at.fit, landscape.predictor.data
+        candidates = explore(landscape, left, self.say)
+        self.seen = at.fit, landscape.predictor
         plain = next(c for c in candidates if not c.effects and c.curve is None)
         return [c for c in candidates if c is plain or self._matters(at, c, plain)], plain.score
+
+    def _released(self, at: Model, candidates: Sequence[Candidate], nothing: float) -> Model | None:
+        """The model with values estimated that its own effects held, before an effect is believed.
+
+        None where they explain no more than they cost. Where a law is simulated each is a program
+        of its own, so there one effect that explains more is tried first.
+        """
+        fit, predictor = self.seen
+        value = np.log(predictor.data.mask.sum() * fit.loop.joints)
+        release = released(predictor, value + DECISIVE)
+        if release is None:
+            return None
+        self.say(f"fit with {release.said}")
+        loop, noise = release.loop, candidates[0].noise
+        name = f"{_piece(at.effects)}, {release.said}"
+        found = self.campaign.piece(name, lambda: self.refits.filtered(loop, noise))
+        if not found.status.simulated:
+            return None
+        model = self._judged(self._added(found), found)
+        cost = release.freedom * value
+        model = dataclasses.replace(model, score=model.score + cost)
+        single = [] if imposed(loop) else [c.score for c in candidates if c.size == 1]
+        rival = at.score + min(min(single, default=np.inf) - nothing, 0.0)
+        if model.score > min(rival + DECISIVE, at.score):
+            return None
+        self.visited.add(model)
+        return model
 
     def _verified(self, at: Model, candidates: Sequence[Candidate], nothing: float) -> Model | None:
         """The best refit of the sets that promise most; None where none is better."""
@@ -196,20 +231,34 @@ class Search:
         assert at.fit is not None
         before: Fit = at.fit
         together = (*at.effects, *asked.effects)
-        had = self.visited.fitted(together)
+        had = self._had(at, together)
         if had is not None:
             return had
         self.say(f"fit with {_listed(asked.effects)}")
-        fit = self.campaign.piece(
-            _piece(together),
-            lambda: self.refits.with_effects(before, asked.effects, asked.noise, promised),
-        )
+        try:
+            fit = self.campaign.piece(
+                _piece(together),
+                lambda: self.refits.with_effects(before, asked.effects, asked.noise, promised),
+            )
+        except (ModelError, FitError) as error:
+            # A candidate that cannot be simulated, at values that the linear system liked.
+            self.failures = (*self.failures, f"no fit with {_listed(asked.effects)}: {error}")
+            return None
         if not fit.status.simulated or not is_there(fit, before):
             return None
         return self._visit(self._added(fit), fit)
 
+    def _had(self, at: Model, effects: Sequence[AbstractEffect]) -> Model | None:
+        """The refit of a set, where values that the start held are free in it as they are here."""
+        had = self.visited.fitted(effects)
+        if had is None or had.fit is None or at.fit is None:
+            return None
+        one, other = had.fit.loop, at.fit.loop
+        alike = bool(eqx.tree_equal(one.controller, other.controller))
+        return had if alike and _released(one) == _released(other) else None
+
     def _without_one(self, at: Model) -> Model | None:
-        """The model without one of its effects, where that is better."""
+        """The model without one of its effects, where that is better, or nothing worth knowing."""
         if len(at.effects) < 2:
             return None
         assert at.fit is not None
@@ -218,10 +267,18 @@ class Search:
             if needed(at.fit, gone, price(len(at.effects), self.forms)):
                 continue
             less = tuple(e for e in at.effects if e is not gone)
-            had = self.visited.fitted(less)
-            found.append(had or self._refitted(at, less))
+            found.append(self._had(at, less) or self._refitted(at, less))
         best = min(found, key=lambda m: m.score, default=at)
-        return best if best.score < at.score else None
+        if best.score < at.score:
+            return best
+        small = [m for m in found if self._lost(m, at) < self.asked.worth]
+        return min(small, key=lambda m: m.score, default=None)
+
+    def _lost(self, less: Model, at: Model) -> float:
+        """Share of some joint's torque by which a model with less explains less, %."""
+        assert less.left is not None
+        assert at.left is not None
+        return float(np.sqrt(np.maximum(less.left**2 - at.left**2, 0.0)).max())
 
     def _refitted(self, at: Model, effects: Sequence[AbstractEffect]) -> Model:
         """A part of a fitted model's effects, fitted from where they are."""
@@ -237,11 +294,15 @@ class Search:
 
     def _visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
         """A fitted model, noted."""
-        judged = score_of(fit, len(effects), self.forms)
-        left = over_recordings(fit.error_percent.to_numpy())
-        model = Model(effects, judged.value, fit=fit, noise=judged.noise, left=left)
+        model = self._judged(effects, fit)
         self.visited.add(model)
         return model
+
+    def _judged(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
+        """A fitted model with its score."""
+        judged = score_of(fit, len(effects), self.forms)
+        left = over_recordings(fit.error_percent.to_numpy())
+        return Model(effects, judged.value, fit=fit, noise=judged.noise, left=left)
 
     def _added(self, fit: Fit) -> tuple[AbstractEffect, ...]:
         """The effects that a fit has over the starting model; they stand last."""
@@ -264,8 +325,9 @@ class Search:
 
     def _left_by(self, c: Candidate) -> np.ndarray:
         """Relative error by joint that a set predicted in the last round leaves, %."""
-        fit, data = self.seen
-        return over_recordings(fit.error_percent.to_numpy() * share_left(fit, data, c.rest))
+        fit, predictor = self.seen
+        left = share_left(fit, predictor.data, c.rest)
+        return over_recordings(fit.error_percent.to_numpy() * left)
 
     def _verdict(self, candidates: Sequence[Candidate], nothing: float) -> tuple[Outcome, bool]:
         unfinished = len(self.at.effects) >= self.asked.most
@@ -292,7 +354,7 @@ class Search:
         steps = self._steps(models)
         models = self._held_out(models, steps)
         reason = "" if unfinished else self._doubt(verdict, steps, models)
-        notes = remarks(steps)
+        notes = (*remarks(steps, self.given), *self.failures)
         if unfinished:
             notes = (f"stopped after {self.asked.most} effects, as told: raise most", *notes)
         return Discovery(
@@ -341,7 +403,7 @@ class Search:
         models = [start]
         for k in range(1, len(self.at.effects)):
             less = self.at.effects[:k]
-            models.append(self.visited.fitted(less) or self._refitted(self.at, less))
+            models.append(self._had(self.at, less) or self._refitted(self.at, less))
         if self.at.effects:
             models.append(self.at)
         steps = []
@@ -372,6 +434,22 @@ class Search:
         last = next(e for e in self.at.effects if form(e) == form(added))
         found = (*self.visited.alike(model, added), *self.visited.alike(self.at, last))
         return tuple(dict.fromkeys(n for n in found if n not in self.at.names))
+
+
+def _check_apart(recordings: Recordings, held_out: Iterable[Recording]) -> None:
+    """Raises `RecordingError` where what is held out was fitted as well, whatever its name."""
+    for unseen in held_out:
+        for fitted in recordings:
+            if np.array_equal(unseen.q, fitted.q) and np.array_equal(unseen.tau, fitted.tau):
+                raise RecordingError(
+                    f"{unseen.name} is held out and has the samples of {fitted.name}, which is "
+                    "fitted: what judges a model must not have made it"
+                )
+
+
+def _released(loop: ClosedLoop) -> set[str]:
+    """Names of free parameters that are held by declaration."""
+    return {p.name for p in loop.free_parameters if not p.declaration.free}
 
 
 def _listed(effects: Sequence[AbstractEffect]) -> str:

@@ -121,17 +121,17 @@ def held_shapes(loop: ClosedLoop, last: int) -> tuple[str, ...]:
 
 
 def of_one_sign(loop: ClosedLoop) -> ClosedLoop:
-    """The loop with one smoothed sign a joint, where that of its Coulomb friction is estimated.
+    """The loop with one smoothed sign per joint, where that of its Coulomb friction is estimated.
 
-    Effects are added with the sharpness it had then, which may come out another beside them.
+    Effects are added with the smoothing it had then, which may come out another beside them.
     """
     estimated, held = {}, []
     for p in loop.parameters:
-        if p.place[0] != "effects" or p.place[2:] != ("gamma",):
+        if p.place[0] != "effects" or p.place[2:] != ("smoothing",):
             continue
         effect: Any = loop.effects[int(p.place[1])]
         if isinstance(effect, Coulomb) and p.name in loop.names:
-            estimated[effect.joint] = float(effect.gamma)
+            estimated[effect.joint] = float(effect.smoothing)
         elif p.name not in loop.names:
             held.append((p.name, getattr(effect, "joint", None)))
     return loop.with_values(**{name: estimated[j] for name, j in held if j in estimated})

@@ -1,6 +1,7 @@
 """What an effect may do, and where on the signal's way it may do it."""
 
 import dataclasses
+import math
 import re
 import zlib
 from collections.abc import Iterable
@@ -19,6 +20,11 @@ from ._scene import Scene
 
 # Of no recording: effects that act on some by name do not act.
 NOBODY = 0
+# Added to a smoothing, rad/s or m/s: no division by zero at standstill, and at zero, its bound, the
+# derivative by it still says in which direction it does better.
+_SHARP = 1e-30
+# Where a hyperbolic tangent is a half.
+_HALF = math.atanh(0.5)
 
 
 def recording_label(name: str) -> int:
@@ -61,6 +67,8 @@ class AbstractEffect(eqx.Module):
     - `on_link`: `torque` acts on the link, beyond what gives way between it and its drive.
     - `joint_fields`: names of the fields that number joints, of an effect that depends on no other
       joints and acts on no others: one program then serves all joints (none by default).
+    - `several`: one joint may have more than one of it, as it has two ends of its travel. Other
+      effects that are found twice on a joint come close to something else, and are no answer.
     - `contact`: it parts and meets again, so that a shape held at a wrong value (how stiff it is)
       leaves a fit in a wrong valley.
     """
@@ -71,6 +79,7 @@ class AbstractEffect(eqx.Module):
     finite: ClassVar[bool] = False
     on_link: ClassVar[bool] = False
     joint_fields: ClassVar[tuple[str, ...]] = ()
+    several: ClassVar[bool] = False
     contact: ClassVar[bool] = False
 
     @classmethod
@@ -203,6 +212,19 @@ def on_joint(joint: int, value: Float[Array, ""], motion: Motion) -> Float[Array
     return jnp.zeros_like(motion.v).at[joint - 1].set(value)
 
 
-def smooth_sign(v: Float[Array, "..."], gamma: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The sign of a velocity made differentiable: 2/pi · arctan(gamma v); gamma in s/rad or s/m."""
-    return 2 / jnp.pi * jnp.arctan(gamma * v)
+def smooth_sign(
+    v: Float[Array, "..."],
+    smoothing: Float[Array, "..."],
+    form: Float[Array, "..."] | None = None,
+) -> Float[Array, "..."]:
+    """The sign of a velocity made differentiable: 2/pi · arctan(v / smoothing).
+
+    **Arguments:**
+
+    - `v`: rad/s or m/s. `smoothing`: the speed at which it is a half, 1/gamma of Brunot et al.
+      2016; at zero it is the sign itself.
+    - `form`: share of a hyperbolic tangent, a half at the same speed, in place of the arctan.
+    """
+    x = v / (smoothing + _SHARP)
+    slow = 2 / jnp.pi * jnp.arctan(x)
+    return slow if form is None else slow + form * (jnp.tanh(_HALF * x) - slow)

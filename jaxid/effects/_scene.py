@@ -9,8 +9,8 @@ class Scene(eqx.Module):
     """Ranges of the recorded motion, one value a joint, in SI units.
 
     - `q_low`, `q_high`: range of position. `speed`, `torque`: largest magnitudes.
-    - `inertia`: what a joint feels while the others are free, averaged. `gamma`: sharpness of its
-      Coulomb friction.
+    - `inertia`: what a joint feels while the others are free, averaged. `smoothing`: of the sign in
+      its Coulomb friction.
     - `period`, `duration`: of the recordings, s. `recordings`: their names.
     - `tones`: frequencies that stand out of the residual's spectrum, Hz.
     - `lengths`: of the links before the last, m; `g`: gravity in their plane, m/s².
@@ -24,7 +24,7 @@ class Scene(eqx.Module):
     speed: Float[np.ndarray, " joints"]
     torque: Float[np.ndarray, " joints"]
     inertia: Float[np.ndarray, " joints"]
-    gamma: Float[np.ndarray, " joints"]
+    smoothing: Float[np.ndarray, " joints"]
     period: float
     duration: float
     recordings: tuple[str, ...]
@@ -45,6 +45,6 @@ class Scene(eqx.Module):
         """Range of a joint's position, rad or m."""
         return float(self.q_high[joint - 1] - self.q_low[joint - 1])
 
-    def sharpness(self, joint: int) -> float:
-        """Sharpness of the sign function on a joint, s/rad or s/m."""
-        return float(self.gamma[joint - 1])
+    def smoothed(self, joint: int) -> float:
+        """Speed at which the sign function of a joint is a half, rad/s or m/s."""
+        return float(self.smoothing[joint - 1])

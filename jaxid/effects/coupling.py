@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from ..parameters import Scalar, as_float64, parameter
 from ._base import AbstractEffect, Motion, smooth_sign
 from ._scene import Scene
-from .friction import sharpness
+from .friction import smoothing_speed
 
 
 class SharedShaft(AbstractEffect):
@@ -32,14 +32,14 @@ class SharedShaft(AbstractEffect):
     coulomb: Scalar = parameter(0.0, symbol="Fcs", unit="N·m", lower=0.0, scale=0.1)
     inertia: Scalar = parameter(0.0, symbol="Ias", unit="kg·m²", lower=0.0, scale=0.01)
     share: Scalar = eqx.field(converter=as_float64, default=1.0)
-    gamma: Scalar = sharpness()
+    smoothing: Scalar = smoothing_speed()
     inertial = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["SharedShaft"]:
         """The pairs that gears couple, or may couple."""
         return [
-            cls(joint=i, driven=j, share=share, gamma=scene.sharpness(j))
+            cls(joint=i, driven=j, share=share, smoothing=scene.smoothed(j))
             for i, j, share in scene.couplings
         ]
 
@@ -48,5 +48,5 @@ class SharedShaft(AbstractEffect):
         way = jnp.zeros_like(motion.v).at[self.joint - 1].set(self.share)
         way = way.at[self.driven - 1].add(1.0)
         speed, rate = way @ motion.v, way @ motion.a
-        friction = self.viscous * speed + self.coulomb * smooth_sign(speed, self.gamma)
+        friction = self.viscous * speed + self.coulomb * smooth_sign(speed, self.smoothing)
         return way * (friction + self.inertia * rate)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from ..parameters import Scalar, as_float64, parameter
 from ._base import AbstractEffect, Motion, on_joint, smooth_sign
-from .friction import sharpness
+from .friction import smoothing_speed
 
 Coordinate = Literal["q", "v", "a", "tau", "t"]
 
@@ -32,7 +32,7 @@ class Curve(AbstractEffect):
     high: Scalar = eqx.field(converter=as_float64, default=1.0)
     signed: bool = eqx.field(static=True, default=False)
     coefficients: Float[Array, " knots"] = parameter((0.0,) * 12, symbol="s", unit="N·m", scale=0.1)
-    gamma: Scalar = sharpness()
+    smoothing: Scalar = smoothing_speed()
     needs_acceleration = True
 
     @property
@@ -61,7 +61,7 @@ class Curve(AbstractEffect):
         x = motion.t if self.coordinate == "t" else getattr(motion, self.coordinate)[self.of - 1]
         value = self.value(x)
         if self.signed:
-            value = value * smooth_sign(motion.v[self.joint - 1], self.gamma)
+            value = value * smooth_sign(motion.v[self.joint - 1], self.smoothing)
         return on_joint(self.joint, value, motion)
 
 

@@ -13,10 +13,13 @@ from ._base import AbstractEffect, Motion, on_joint, smooth_sign
 from ._scene import Scene
 
 
-def sharpness() -> Any:
-    """The field for the sharpness of a smoothed sign, 100 s/rad as in Brunot et al. 2016."""
+def smoothing_speed() -> Any:
+    """The field for the speed at which a smoothed sign is a half, 1/100 rad/s (Brunot et al. 2016).
+
+    Friction sharper than the samples can tell ends at zero, its bound.
+    """
     return parameter(
-        100.0, symbol="gamma", unit="s/rad", lower=0.0, scale=100.0, free=False, linear=False
+        0.01, symbol="eps", unit="rad/s", lower=0.0, scale=0.01, free=False, linear=False
     )
 
 
@@ -33,16 +36,23 @@ class Viscous(AbstractEffect):
 
 
 class Coulomb(AbstractEffect):
-    """Dry friction, smoothed: Fc sigma(v), sigma = 2/pi arctan(gamma v) (Brunot et al. 2016)."""
+    """Dry friction, smoothed: Fc sigma(v), sigma = 2/pi arctan(v/eps) (Brunot et al. 2016).
+
+    `form` leads from the arctan at 0 to tanh(v/eps · artanh(1/2)) at 1, which reaches the sign's
+    value sooner; at either, sigma is a half at v = eps.
+    """
 
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     level: Scalar = parameter(0.0, symbol="Fc", unit="N·m", lower=0.0, scale=0.1)
-    gamma: Scalar = sharpness()
+    smoothing: Scalar = smoothing_speed()
+    form: Scalar = parameter(
+        0.0, symbol="form", unit="1", lower=0.0, upper=1.0, scale=1.0, free=False, linear=False
+    )
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """Fc sigma(v) on the joint, `(joints,)`."""
-        sign = smooth_sign(motion.v[self.joint - 1], self.gamma)
+        sign = smooth_sign(motion.v[self.joint - 1], self.smoothing, self.form)
         return on_joint(self.joint, self.level * sign, motion)
 
 
@@ -55,7 +65,7 @@ class Stribeck(AbstractEffect):
     velocity: Scalar = parameter(
         0.1, symbol="vs", unit="rad/s", lower=1e-4, scale=0.1, linear=False
     )
-    gamma: Scalar = sharpness()
+    smoothing: Scalar = smoothing_speed()
 
     @classmethod
     def spoken(cls) -> str:
@@ -67,7 +77,7 @@ class Stribeck(AbstractEffect):
         """Velocities from a fiftieth to a half of the highest speed."""
         shares = np.geomspace(0.02, 0.5, 7)
         return [
-            cls(joint=j, velocity=share * scene.speed[j - 1], gamma=scene.sharpness(j))
+            cls(joint=j, velocity=share * scene.speed[j - 1], smoothing=scene.smoothed(j))
             for j in scene.joints
             for share in shares
         ]
@@ -76,7 +86,7 @@ class Stribeck(AbstractEffect):
         """Fs exp(-(v/vs)²) sigma(v) on the joint, `(joints,)`."""
         v = motion.v[self.joint - 1]
         fall = jnp.exp(-((v / self.velocity) ** 2))
-        return on_joint(self.joint, self.level * fall * smooth_sign(v, self.gamma), motion)
+        return on_joint(self.joint, self.level * fall * smooth_sign(v, self.smoothing), motion)
 
 
 class AsymmetricFriction(AbstractEffect):
@@ -89,17 +99,17 @@ class AsymmetricFriction(AbstractEffect):
     joint: int = eqx.field(static=True)
     viscous: Scalar = parameter(0.0, symbol="dFv", unit="N·m·s/rad", scale=0.05)
     coulomb: Scalar = parameter(0.0, symbol="dFc", unit="N·m", scale=0.1)
-    gamma: Scalar = sharpness()
+    smoothing: Scalar = smoothing_speed()
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["AsymmetricFriction"]:
         """Every joint."""
-        return [cls(joint=j, gamma=scene.sharpness(j)) for j in scene.joints]
+        return [cls(joint=j, smoothing=scene.smoothed(j)) for j in scene.joints]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """(dFv v + dFc sigma(v)) sigma(v) on the joint, `(joints,)`."""
         v = motion.v[self.joint - 1]
-        sign = smooth_sign(v, self.gamma)
+        sign = smooth_sign(v, self.smoothing)
         return on_joint(self.joint, (self.viscous * v + self.coulomb * sign) * sign, motion)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from ..parameters import Scalar, parameter
 from ._base import AbstractEffect, Motion, on_joint, smooth_sign
 from ._scene import Scene
-from .friction import sharpness
+from .friction import smoothing_speed
 
 
 class LoadDependentFriction(AbstractEffect):
@@ -23,18 +23,18 @@ class LoadDependentFriction(AbstractEffect):
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     ratio: Scalar = parameter(0.0, symbol="alpha", unit="1", lower=0.0, upper=0.95, scale=0.1)
-    gamma: Scalar = sharpness()
+    smoothing: Scalar = smoothing_speed()
     loaded = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["LoadDependentFriction"]:
         """Every joint."""
-        return [cls(joint=j, gamma=scene.sharpness(j)) for j in scene.joints]
+        return [cls(joint=j, smoothing=scene.smoothed(j)) for j in scene.joints]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """alpha |tau_link| sigma(v) on the joint, `(joints,)`."""
         j = self.joint - 1
-        share = self.ratio * smooth_sign(motion.v[j], self.gamma)
+        share = self.ratio * smooth_sign(motion.v[j], self.smoothing)
         available = motion.tau[j]
         link = jnp.abs(available) / (1 + share * jnp.sign(available))
         return on_joint(self.joint, share * link, motion)
@@ -53,7 +53,7 @@ class PositionDependentFriction(AbstractEffect):
     B1: Scalar = parameter(0.0, symbol="FB1_", unit="N·m", scale=0.1)
     A2: Scalar = parameter(0.0, symbol="FA2_", unit="N·m", scale=0.1)
     B2: Scalar = parameter(0.0, symbol="FB2_", unit="N·m", scale=0.1)
-    gamma: Scalar = sharpness()
+    smoothing: Scalar = smoothing_speed()
     turn: float = eqx.field(static=True, default=2 * np.pi)
 
     @classmethod
@@ -62,7 +62,7 @@ class PositionDependentFriction(AbstractEffect):
         return [
             cls(
                 joint=j,
-                gamma=scene.sharpness(j),
+                smoothing=scene.smoothed(j),
                 turn=2 * scene.travel(j) if scene.slides[j - 1] else 2 * np.pi,
             )
             for j in scene.joints
@@ -74,7 +74,7 @@ class PositionDependentFriction(AbstractEffect):
         angle = 2 * jnp.pi / self.turn * motion.q[j]
         wave = self.A1 * jnp.cos(angle) + self.B1 * jnp.sin(angle)
         wave = wave + self.A2 * jnp.cos(2 * angle) + self.B2 * jnp.sin(2 * angle)
-        return on_joint(self.joint, wave * smooth_sign(motion.v[j], self.gamma), motion)
+        return on_joint(self.joint, wave * smooth_sign(motion.v[j], self.smoothing), motion)
 
 
 class ThermalDrift(AbstractEffect):
@@ -87,13 +87,13 @@ class ThermalDrift(AbstractEffect):
     time_constant: Scalar = parameter(
         10.0, symbol="T", unit="s", lower=1e-2, scale=10.0, linear=False
     )
-    gamma: Scalar = sharpness()
+    smoothing: Scalar = smoothing_speed()
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["ThermalDrift"]:
         """Time constants from a twentieth of the recordings to twice their length."""
         return [
-            cls(joint=j, time_constant=share * scene.duration, gamma=scene.sharpness(j))
+            cls(joint=j, time_constant=share * scene.duration, smoothing=scene.smoothed(j))
             for j in scene.joints
             for share in np.geomspace(0.06, 1.5, 5)
         ]
@@ -101,7 +101,7 @@ class ThermalDrift(AbstractEffect):
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """The fading part of friction on the joint, `(joints,)`."""
         v = motion.v[self.joint - 1]
-        friction = self.viscous * v + self.coulomb * smooth_sign(v, self.gamma)
+        friction = self.viscous * v + self.coulomb * smooth_sign(v, self.smoothing)
         return on_joint(self.joint, friction * jnp.exp(-motion.t / self.time_constant), motion)
 
 

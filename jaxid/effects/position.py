@@ -16,6 +16,7 @@ class TorqueRipple(AbstractEffect):
     """Cogging and gear ripple: A cos(n q) + B sin(n q), n unknown."""
 
     joint_fields = ("joint",)
+    several = True
     joint: int = eqx.field(static=True)
     A: Scalar = parameter(0.0, symbol="RA", unit="N·m", scale=0.1)
     B: Scalar = parameter(0.0, symbol="RB", unit="N·m", scale=0.1)
@@ -74,6 +75,7 @@ class EndStop(AbstractEffect):
     """
 
     joint_fields = ("joint",)
+    several = True
     joint: int = eqx.field(static=True)
     stiffness: Scalar = parameter(0.0, symbol="ke", unit="N·m/rad", lower=0.0, scale=1.0)
     angle: Scalar = parameter(0.0, symbol="qe", unit="rad", scale=0.1, linear=False)

@@ -167,7 +167,8 @@ def _new_weights(
     The floor is of the signal's size: one of the present weights would rise from round to round.
     """
     residual, now = np.asarray(point.found.residual), np.asarray(problem.weights)
-    samples = np.sum(np.asarray(problem.batch.kept))
+    # Rows at which a joint stands still are zero, and none that count.
+    samples = np.maximum(np.count_nonzero(residual, axis=(0, 1)), 1)
     spread = np.sqrt(np.einsum("rko,rko->o", residual, residual) / samples) / now
     return jnp.asarray(1 / np.maximum(spread, _FLOOR / np.asarray(first)))
 

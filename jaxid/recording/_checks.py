@@ -2,8 +2,9 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Literal, get_args
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float64
 
@@ -12,13 +13,43 @@ from ._problem import problem
 from ._units import SIGNALS, Units, factors
 
 Gaps = Literal["refuse", "allow"]
+Nan = Literal["refuse", "drop"]
+Clock = Literal["recorded", "even"]
 Labels = Mapping[str, Sequence[str]]
+Lines = Sequence[int]
 
 _FEWEST_SAMPLES = 20
 _LARGEST = 1e30
+# Jitter of times in steps that is looked at, and how much smoother a motion then has to be on even
+# times for them to be the right ones.
+_JITTER, _ROUGHER = 0.05, 2.0
 
 
-def numeric(source: str, column: str, values: object) -> Float64[np.ndarray, "..."]:
+class Accept(eqx.Module):
+    """What of a recording's faults to put up with.
+
+    - `gaps`: `"allow"` for missing stretches of time.
+    - `nan`: `"drop"` to leave out samples at which a signal is empty.
+    - `clock`: `"even"` to put a straight line in place of times that jitter.
+    """
+
+    gaps: Gaps = "refuse"
+    nan: Nan = "refuse"
+    clock: Clock = "recorded"
+
+    def __check_init__(self) -> None:
+        for name, chosen, known in (
+            ("gaps", self.gaps, get_args(Gaps)),
+            ("nan", self.nan, get_args(Nan)),
+            ("clock", self.clock, get_args(Clock)),
+        ):
+            if chosen not in known:
+                raise problem("read()", f"{name} is {chosen!r}", f"give {' or '.join(known)}")
+
+
+def numeric(
+    source: str, column: str, values: object, lines: Lines = ()
+) -> Float64[np.ndarray, "..."]:
     """Numbers as float64, of whatever shape they came in.
 
     **Arguments:**
@@ -26,6 +57,7 @@ def numeric(source: str, column: str, values: object) -> Float64[np.ndarray, "..
     - `source`: the file or recording they come from.
     - `column`: their name there.
     - `values`: array-like; a missing value becomes NaN.
+    - `lines`: of its rows in a text file.
 
     **Raises:** `RecordingError` for text, objects, booleans, dates, complex or ragged values.
     """
@@ -46,10 +78,10 @@ def numeric(source: str, column: str, values: object) -> Float64[np.ndarray, "..
             f"{column} is ragged or no array of numbers",
             "give one number for each sample and joint",
         ) from error
-    raise _not_numeric(source, column, array)
+    raise _not_numeric(source, column, array, lines)
 
 
-def _not_numeric(source: str, column: str, array: np.ndarray) -> Exception:
+def _not_numeric(source: str, column: str, array: np.ndarray, lines: Lines) -> Exception:
     remedies = {
         "b": ("booleans", "give it as numbers"),
         "c": ("complex values", "give its real part"),
@@ -61,11 +93,11 @@ def _not_numeric(source: str, column: str, array: np.ndarray) -> Exception:
         return problem(source, f"{column} holds {kind}", remedy)
     for index, cell in np.ndenumerate(array):
         if not is_number(cell):
-            row = index[0] + 1 if index else 1
             return problem(
                 source,
-                f"{column}, row {row} holds {brief(cell)}, which is not a number",
-                "correct or remove that row, and write numbers with a decimal point",
+                f"{column}, {place(index[0] if index else 0, lines)} holds {brief(cell)}, which "
+                "is not a number",
+                "correct or remove it, and write numbers with a decimal point",
             )
     return problem(
         source, f"{column} holds text or Python objects", "convert it to floats beforehand"
@@ -81,12 +113,18 @@ def is_number(cell: object) -> bool:
     return True
 
 
+def place(row: int, lines: Lines) -> str:
+    """Where a row, counted from 0, is in the file, or in the array that has no lines."""
+    return f"line {lines[row]}" if lines else f"row {row + 1}"
+
+
 def validate(
     source: str,
     signals: Mapping[str, Float64[np.ndarray, "..."]],
     labels: Labels,
     units: Units | None,
-    gaps: Gaps,
+    accept: "Accept",
+    lines: Lines = (),
 ) -> dict[str, Float64[np.ndarray, "..."]]:
     """Signals in SI that are safe to compute with.
 
@@ -96,7 +134,8 @@ def validate(
     - `signals`: values by signal, in the units of the file; 1-d means one joint.
     - `labels`: what the file calls the columns of each signal.
     - `units`: unit by signal.
-    - `gaps`: `"allow"` to accept missing stretches of time.
+    - `accept`: what of the file's faults to put up with.
+    - `lines`: of the rows in a text file.
 
     **Returns:** `time` `(samples,)` and the others `(samples, joints)`.
 
@@ -110,6 +149,8 @@ def validate(
             f"there are {len(shaped['time'])} samples",
             f"record at least {_FEWEST_SAMPLES}",
         )
+    if accept.nan == "drop":
+        shaped, lines = _without_blanks(source, shaped, lines)
     checked = {}
     for signal, values in shaped.items():
         joints = values.shape[1] if values.ndim == 2 else 1
@@ -121,13 +162,70 @@ def validate(
             )
         with np.errstate(over="ignore"):
             checked[signal] = values * scale[signal]
-        _finite(source, signal, checked[signal], labels)
-        _bounded(source, signal, checked[signal], labels)
-    _increasing(source, checked["time"], labels, gaps)
+        _finite(source, signal, checked[signal], labels, lines)
+        _bounded(source, signal, checked[signal], labels, lines)
+    if accept.clock == "even":
+        checked["time"] = _even(source, checked["time"])
+    _increasing(source, checked["time"], labels, accept.gaps, lines)
+    _steady(source, checked)
     for signal in ("q", "tau"):
         _moving(source, signal, checked[signal], labels)
     _plausible(source, checked, units or {})
     return checked
+
+
+def _without_blanks(
+    source: str, signals: dict[str, Float64[np.ndarray, "..."]], lines: Lines
+) -> tuple[dict[str, Float64[np.ndarray, "..."]], Lines]:
+    """Signals less the samples at which one of them is empty, which a warning counts."""
+    blank = np.any(
+        [~np.isfinite(x.reshape(len(x), -1)).all(axis=1) for x in signals.values()], axis=0
+    )
+    if not blank.any():
+        return signals, lines
+    warnings.warn(
+        f"{source}: {blank.sum()} of {len(blank)} samples are left out, since a signal is empty "
+        f"or not finite there, first at {place(int(np.argmax(blank)), lines)}.",
+        JaxidWarning,
+        stacklevel=5,
+    )
+    kept = tuple(line for line, gone in zip(lines, blank, strict=True) if not gone) if lines else ()
+    return {name: x[~blank] for name, x in signals.items()}, kept
+
+
+def _even(source: str, time: Float64[np.ndarray, " samples"]) -> Float64[np.ndarray, " samples"]:
+    """The straight line through recorded times, of which there is one for each sample."""
+    number = np.arange(len(time))
+    slope, first = np.polyfit(number, time, 1)
+    if not slope > 0:
+        raise problem(source, "time does not grow over the recording", "give it in seconds")
+    return first + slope * number
+
+
+def _steady(source: str, signals: Mapping[str, Float64[np.ndarray, "..."]]) -> None:
+    """Warns of times that jitter though the samples do not: a logger's times, not the drive's.
+
+    Along its true times a motion is smooth. Where it is far smoother on even ones, these are it.
+    """
+    time, q = signals["time"], signals["q"]
+    steps = np.diff(time)
+    usual = float(np.median(steps))
+    jitter = float(np.quantile(np.abs(steps - usual), 0.9))
+    if jitter < _JITTER * usual or missing_after(time).any():
+        return
+    even = np.linspace(time[0], time[-1], len(time))
+    rough = [
+        np.std(np.diff(np.diff(q, axis=0) / np.diff(t)[:, None], axis=0)) for t in (time, even)
+    ]
+    if rough[0] > _ROUGHER * rough[1]:
+        warnings.warn(
+            f"{source}: times jitter by {1e3 * jitter:.3g} ms about {1e3 * usual:.3g} ms, and "
+            f"positions are {rough[0] / rough[1]:.2g} times as smooth on even times, so these "
+            'are times at which a logger wrote, not at which the drive sampled; pass clock="even" '
+            "(--clock even), or record the drive's own times.",
+            JaxidWarning,
+            stacklevel=5,
+        )
 
 
 def _label(labels: Labels, signal: str, joint: int, joints: int) -> str:
@@ -173,20 +271,24 @@ def _shapes(
     return shaped
 
 
-def _finite(source: str, signal: str, values: Float64[np.ndarray, "..."], labels: Labels) -> None:
+def _finite(
+    source: str, signal: str, values: Float64[np.ndarray, "..."], labels: Labels, lines: Lines
+) -> None:
     if np.isfinite(values).all():
         return
     table = values.reshape(len(values), -1)
     row, joint = np.argwhere(~np.isfinite(table))[0].tolist()
     raise problem(
         source,
-        f"{_label(labels, signal, joint, table.shape[1])}, row {row + 1} is empty or not finite "
-        f"({table[row, joint]})",
-        "remove that row or cut the recording there",
+        f"{_label(labels, signal, joint, table.shape[1])}, {place(row, lines)} is empty or not "
+        f"finite ({table[row, joint]})",
+        'remove that sample, or pass nan="drop" to leave such samples out (--drop-nan)',
     )
 
 
-def _bounded(source: str, signal: str, values: Float64[np.ndarray, "..."], labels: Labels) -> None:
+def _bounded(
+    source: str, signal: str, values: Float64[np.ndarray, "..."], labels: Labels, lines: Lines
+) -> None:
     """Squares and products of what is larger leave float64, and no robot is that large."""
     table = values.reshape(len(values), -1)
     row, joint = np.unravel_index(np.abs(table).argmax(), table.shape)
@@ -194,13 +296,13 @@ def _bounded(source: str, signal: str, values: Float64[np.ndarray, "..."], label
         raise problem(
             source,
             f"{_label(labels, signal, int(joint), table.shape[1])} reaches {table[row, joint]:.3g} "
-            f"in SI units at row {row + 1}",
-            "correct that row, or name the unit it is in",
+            f"in SI units at {place(int(row), lines)}",
+            "correct it, or name the unit it is in",
         )
 
 
 def _increasing(
-    source: str, time: Float64[np.ndarray, " samples"], labels: Labels, gaps: Gaps
+    source: str, time: Float64[np.ndarray, " samples"], labels: Labels, gaps: Gaps, lines: Lines
 ) -> None:
     label = _label(labels, "time", 0, 1)
     with np.errstate(over="ignore"):
@@ -210,7 +312,8 @@ def _increasing(
         verb = "repeats" if steps[row] == 0 else "goes back"
         raise problem(
             source,
-            f"{label} {verb} at row {row + 2} ({time[row + 1]:.9g} s after {time[row]:.9g} s)",
+            f"{label} {verb} at {place(row + 1, lines)} ({time[row + 1]:.9g} s after "
+            f"{time[row]:.9g} s)",
             "sort the rows by time and drop the repeated ones",
         )
     if not np.isfinite(span):
@@ -220,9 +323,9 @@ def _increasing(
         row = int(np.argmax(too_long))
         raise problem(
             source,
-            f"{label} has a gap of {steps[row]:.4g} s before row {row + 2}, where the usual step "
-            f"is {np.median(steps):.4g} s",
-            'split the recording there or pass gaps="allow"',
+            f"{label} has a gap of {steps[row]:.4g} s before {place(row + 1, lines)}, where the "
+            f"usual step is {np.median(steps):.4g} s",
+            'split the recording there, or pass gaps="allow" (--gaps allow)',
         )
 
 

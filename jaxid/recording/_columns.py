@@ -24,11 +24,13 @@ Columns = Mapping[str, str | Sequence[str]]
 class Table(eqx.Module):
     """Named columns of one file, not yet looked at.
 
-    `refused` names what the file also holds but cannot be a column, and says what it is.
+    `refused` names what the file also holds but cannot be a column, and says what it is. `lines`
+    are the rows' lines in a text file.
     """
 
     columns: dict[str, object]
     refused: dict[str, str] = eqx.field(default_factory=dict)
+    lines: tuple[int, ...] = ()
 
 
 class Layout(eqx.Module):
@@ -66,12 +68,14 @@ def known_layouts() -> tuple[Layout, ...]:
 class Picked(eqx.Module):
     """Signals found in a table, in its units, with the names they have there.
 
-    `quantised` says that positions are whole encoder counts where they look like it.
+    `quantised` says that positions are whole encoder counts where they look like it. `lines` are
+    the rows' lines in a text file.
     """
 
     signals: dict[str, Float64[np.ndarray, "..."]]
     labels: dict[str, list[str]]
     quantised: bool = False
+    lines: tuple[int, ...] = ()
 
 
 def pick(source: str, table: Table, columns: Columns | None) -> Picked:
@@ -92,14 +96,14 @@ def pick(source: str, table: Table, columns: Columns | None) -> Picked:
         known = None
     labels = _resolve(source, table, known[1] if known else columns)
     signals = {signal: _stack(source, table, signal, names) for signal, names in labels.items()}
-    return Picked(signals, labels, known is not None and known[0].quantised)
+    return Picked(signals, labels, known is not None and known[0].quantised, table.lines)
 
 
-def from_frame(source: str, frame: "pd.DataFrame") -> Table:
+def from_frame(source: str, frame: "pd.DataFrame", lines: tuple[int, ...] = ()) -> Table:
     """The columns of a DataFrame, each named once."""
     names = [str(name).strip() for name in frame.columns]
     unique(source, names)
-    return Table({name: frame.iloc[:, i] for i, name in enumerate(names)})
+    return Table({name: frame.iloc[:, i] for i, name in enumerate(names)}, {}, lines)
 
 
 def unique(source: str, names: Sequence[str]) -> None:
@@ -219,7 +223,7 @@ def _stack(
 
 def _column(source: str, table: Table, signal: str, name: str) -> Float64[np.ndarray, "..."]:
     if name in table.columns:
-        return numeric(source, name, table.columns[name])
+        return numeric(source, name, table.columns[name], table.lines)
     if "*" not in name or name in table.refused:
         raise missing(source, table, signal, name)
     factors = [_factor(source, table, signal, factor.strip()) for factor in name.split("*")]

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import JaxidError, RecordingError, brief, require
 from ..storage.arrays import npy
-from ._checks import Gaps, is_number
+from ._checks import Accept, Clock, Gaps, Nan, is_number
 from ._columns import Columns, Table, from_frame, pick, unique
 from ._matlab import order_of, variables
 from ._problem import problem
@@ -30,6 +30,8 @@ def read(
     units: Units | None = None,
     resolution: float | int | Sequence[float] | None = None,
     gaps: Gaps = "refuse",
+    nan: Nan = "refuse",
+    clock: Clock = "recorded",
     largest: int = LARGEST,
 ) -> Recordings:
     """Reads recordings from `.csv`, `.tsv`, `.txt` (or these `.gz`), `.parquet`, `.mat`, `.npz`.
@@ -45,6 +47,8 @@ def read(
       where silent, `q_ref` as `q`, `tau_ff` as `tau`.
     - `resolution`: encoder step, one or one for each joint, rad or m.
     - `gaps`: `"allow"` to accept missing stretches of time.
+    - `nan`: `"drop"` to leave out samples at which a signal is empty; a warning counts them.
+    - `clock`: `"even"` to take samples for evenly spaced, where a logger's times jitter.
     - `largest`: size in bytes, unpacked, above which a file is refused; text takes about ten times
       that much memory while it is read.
 
@@ -53,9 +57,18 @@ def read(
     """
     if not paths:
         raise problem("read()", "no file was given", "pass at least one path")
+    accept = Accept(gaps, nan, clock)
     return Recordings.of(
-        _read_one(Path(path), columns, units, resolution, gaps, largest) for path in paths
+        _read_one(Path(path), columns, units, resolution, accept, largest) for path in paths
     )
+
+
+def columns_of(path: str | os.PathLike[str], *, largest: int = LARGEST) -> tuple[str, ...]:
+    """Names of the columns, or arrays, that a file has.
+
+    **Raises:** `RecordingError` for a file that cannot be read.
+    """
+    return tuple(_table(Path(path), largest).columns)
 
 
 def _read_one(
@@ -63,9 +76,15 @@ def _read_one(
     columns: Columns | None,
     units: Units | None,
     resolution: float | int | Sequence[float] | None,
-    gaps: Gaps,
+    accept: Accept,
     largest: int,
 ) -> Recording:
+    inner = path.with_suffix("") if path.suffix.lower() == ".gz" else path
+    picked = pick(str(path), _table(path, largest), columns)
+    return build(str(path), inner.stem, picked, units, resolution, accept)
+
+
+def _table(path: Path, largest: int) -> Table:
     source = str(path)
     zipped = path.suffix.lower() == ".gz"
     inner = path.with_suffix("") if zipped else path
@@ -73,7 +92,7 @@ def _read_one(
     reader = _reader(source, inner.suffix.lower(), zipped)
     try:
         data = _gunzip(source, data, largest) if zipped else data
-        table = reader(source, data, largest)
+        return reader(source, data, largest)
     except JaxidError:
         raise
     except Exception as error:  # parsers of broken files raise nearly anything
@@ -83,8 +102,6 @@ def _read_one(
             f"another kind ({type(error).__name__}: {error})",
             "write or copy the file again",
         ) from error
-    picked = pick(source, table, columns)
-    return build(source, inner.stem, picked, units, resolution, gaps)
 
 
 def _reader(source: str, extension: str, zipped: bool) -> Callable[[str, bytes, int], Table]:
@@ -155,16 +172,18 @@ def _text(source: str, data: bytes, largest: int) -> Table:
         raise _binary(source) from error
     if "\0" in text:
         raise _binary(source)
-    lines = [line for line in io.StringIO(text, newline=None) if line.strip()]
-    names, delimiter, rows = _header(source, lines)
+    counted = enumerate(io.StringIO(text, newline=None), start=1)
+    lines = [(number, line) for number, line in counted if line.strip()]
+    names, delimiter, numbered = _header(source, lines)
     unique(source, names)
-    for row, line in enumerate(rows, start=1):
+    for number, line in numbered:
         if (cells := len(_cells(line, delimiter))) != len(names):
             raise problem(
                 source,
-                f"row {row} has {cells} cells where the header has {len(names)}",
-                "complete or remove that row",
+                f"line {number} has {cells} cells where the header has {len(names)}",
+                "complete or remove that line",
             )
+    rows = [line for _, line in numbered]
     if not rows:
         raise problem(source, "there is a header and no rows", "record or copy it again")
     frame = pd.read_csv(
@@ -176,18 +195,22 @@ def _text(source: str, data: bytes, largest: int) -> Table:
     )
     if len(frame) != len(rows):
         raise problem(source, "a quoted cell runs over several rows", "remove its quotes")
-    return from_frame(source, frame.set_axis(names, axis="columns"))
+    at = tuple(number for number, _ in numbered)
+    return from_frame(source, frame.set_axis(names, axis="columns"), at)
 
 
 def _binary(source: str) -> Exception:
     return problem(source, "is not UTF-8 text", "export it as plain text, or rename a binary file")
 
 
-def _header(source: str, lines: list[str]) -> tuple[list[str], str, list[str]]:
-    """Column names, delimiter (empty for blanks) and the lines below."""
-    comments = list(itertools.takewhile(_is_comment, lines))
-    rows = list(itertools.filterfalse(_is_comment, lines))
-    first = rows[0] if rows else ""
+Numbered = list[tuple[int, str]]
+
+
+def _header(source: str, lines: Numbered) -> tuple[list[str], str, Numbered]:
+    """Column names, delimiter (empty for blanks) and the lines below with their numbers."""
+    comments = list(itertools.takewhile(_is_comment, (line for _, line in lines)))
+    rows = [pair for pair in lines if not _is_comment(pair[1])]
+    first = rows[0][1] if rows else ""
     delimiter = max(",;\t|", key=first.count)
     delimiter = delimiter if delimiter in first else ""
     if not first:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from ..errors import brief, near
-from ._checks import Gaps, numeric, validate
+from ._checks import Accept, Clock, Gaps, Nan, numeric, validate
 from ._columns import Columns, Picked, from_frame, pick, quantum
 from ._problem import problem
 from ._units import SIGNALS, Units
@@ -60,6 +60,8 @@ class Recording(eqx.Module):
         name: str = "recording",
         units: Units | None = None,
         gaps: Gaps = "refuse",
+        nan: Nan = "refuse",
+        clock: Clock = "recorded",
     ) -> "Recording":
         """A recording from array-likes, checked.
 
@@ -71,7 +73,7 @@ class Recording(eqx.Module):
         - `resolution`: encoder step, one or one for each joint, rad or m.
         - `name`: how tables and figures call it.
         - `units`: unit by signal where it is not SI, as in `jaxid.read`.
-        - `gaps`: `"allow"` to accept missing stretches of time.
+        - `gaps`, `nan`, `clock`: as in `jaxid.read`.
 
         **Raises:** `RecordingError` for whatever makes them unusable.
         """
@@ -82,7 +84,9 @@ class Recording(eqx.Module):
             if values is not None or signal in ("time", "q", "tau")
         }
         labels = {"time": ["time"]}
-        return build(name, name, Picked(signals, labels), units, resolution, gaps)
+        return build(
+            name, name, Picked(signals, labels), units, resolution, Accept(gaps, nan, clock)
+        )
 
     @classmethod
     def from_dataframe(
@@ -94,13 +98,15 @@ class Recording(eqx.Module):
         units: Units | None = None,
         resolution: float | int | Sequence[float] | np.ndarray | None = None,
         gaps: Gaps = "refuse",
+        nan: Nan = "refuse",
+        clock: Clock = "recorded",
     ) -> "Recording":
         """A recording from a DataFrame, checked.
 
         **Arguments:**
 
         - `frame`: one row for each sample, columns as in `jaxid.read`.
-        - `columns`, `units`, `gaps`: as in `jaxid.read`.
+        - `columns`, `units`, `gaps`, `nan`, `clock`: as in `jaxid.read`.
         - `name`, `resolution`: as in `from_arrays`; where None, what `to_dataframe` noted.
 
         **Raises:** `RecordingError` for whatever makes it unusable.
@@ -108,7 +114,7 @@ class Recording(eqx.Module):
         name = str(name or frame.attrs.get("name") or "recording")
         resolution = frame.attrs.get("resolution") if resolution is None else resolution
         picked = pick(name, from_frame(name, frame), columns)
-        return build(name, name, picked, units, resolution, gaps)
+        return build(name, name, picked, units, resolution, Accept(gaps, nan, clock))
 
     @property
     def samples(self) -> int:
@@ -282,7 +288,7 @@ def build(
     picked: Picked,
     units: Units | None,
     resolution: float | int | Sequence[float] | np.ndarray | None,
-    gaps: Gaps,
+    accept: Accept,
 ) -> Recording:
     """A recording of signals that were found, once they pass all checks.
 
@@ -291,11 +297,12 @@ def build(
     - `source`: what messages call it, e.g. its path.
     - `name`: the recording's name.
     - `picked`: the signals, in the units of the file.
-    - `units`, `resolution`, `gaps`: as in `jaxid.read`.
+    - `units`, `resolution`: as in `jaxid.read`.
+    - `accept`: what of their faults to put up with.
 
     **Raises:** `RecordingError` for whatever makes them unusable.
     """
-    signals = validate(source, picked.signals, picked.labels, units, gaps)
+    signals = validate(source, picked.signals, picked.labels, units, accept, picked.lines)
     joints = signals["q"].shape[1]
     step = quantum(signals["q"]) if picked.quantised else None
     if resolution is not None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,6 +11,8 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ..errors import RecordingError
 from ..recording import Recording
+
+Moving = Callable[[Recording, float], Bool[np.ndarray, "samples joints"] | None]
 
 ORDER = 4
 # Samples in a period of the cutoff: half of them reach to where the filter has a sixth left.
@@ -115,19 +118,30 @@ class Band(eqx.Module):
 
     - `gain`: the filter's at the frequencies of a real Fourier transform.
     - `rows`: the samples that are left, far enough from the ends; `keep` says which are there.
+    - `moving`: in which of these rows a joint moves; in the others nothing of it is compared, and
+      its signals are zero. None where all rows count.
     """
 
     gain: Float[Array, "recordings frequencies"]
     rows: Int[Array, "recordings rows"]
     keep: Bool[Array, "recordings rows"]
+    moving: Bool[Array, "recordings rows joints"] | None = None
 
     @classmethod
-    def of(cls, recordings: list[Recording], cutoffs: list[float], samples: int) -> "Band":
+    def of(
+        cls,
+        recordings: list[Recording],
+        cutoffs: list[float],
+        samples: int,
+        moving: Moving = lambda recording, cutoff: None,
+    ) -> "Band":
         """The band of recordings that are padded to `samples`.
 
         **Arguments:**
 
         - `cutoffs`: up to which each recording's motion is known, Hz; the lowest is that of all.
+        - `moving`: at which samples of a recording joints move, `(samples, joints)`, below a
+          cutoff, Hz; None for all.
 
         **Raises:** `RecordingError` where a recording is over before the filter has settled.
         """
@@ -151,7 +165,10 @@ class Band(eqx.Module):
         most = max(len(row) for row in rows)
         keep = np.arange(most) < np.array([[len(row)] for row in rows])
         filled = np.stack([np.pad(row, (0, most - len(row)), "edge") for row in rows])
-        return cls(jnp.asarray(np.stack(gains)), jnp.asarray(filled), jnp.asarray(keep))
+        there = [moving(r, cutoff) for r in recordings]
+        moves = [m[row] for m, row in zip(there, filled, strict=True) if m is not None]
+        still = None if len(moves) < len(there) else jnp.asarray(np.stack(moves))
+        return cls(jnp.asarray(np.stack(gains)), jnp.asarray(filled), jnp.asarray(keep), still)
 
     def __call__(
         self, x: Float[Array, "recordings samples *axes"]
@@ -161,7 +178,10 @@ class Band(eqx.Module):
         size = 2 * (self.gain.shape[1] - 1)
         wave = jnp.fft.rfft(x, size, axis=1) * self.gain.reshape(*self.gain.shape, *axes)
         passed = self.picked(jnp.fft.irfft(wave, size, axis=1))
-        return passed * self.keep.reshape(*self.keep.shape, *axes)
+        passed = passed * self.keep.reshape(*self.keep.shape, *axes)
+        if self.moving is None:
+            return passed
+        return passed * self.moving.reshape(*self.moving.shape, *axes[1:])
 
     def picked(
         self, x: Shaped[Array, "recordings samples *axes"]

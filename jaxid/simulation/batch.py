@@ -269,7 +269,8 @@ def band_of(loop: ClosedLoop, recordings: Recordings | Sequence[Recording]) -> B
     given = [c for c in cutoffs if c is not None]
     if len(given) < len(cutoffs):
         return None
-    return Band.of(list(recordings), given, max(r.samples for r in recordings))
+    longest = max(r.samples for r in recordings)
+    return Band.of(list(recordings), given, longest, loop.controller.moving)
 
 
 def compared(

@@ -103,11 +103,11 @@ def band_trace(name: str, x: np.ndarray, lower: np.ndarray, upper: np.ndarray) -
 
 
 def shade_gaps(figure: go.Figure, time: np.ndarray, traces: Sequence[Trace]) -> None:
-    """Shade in the left column where the measured signals (or all, if none is) are missing."""
+    """Shade in the left column where the measured signals (or all, if none is) are all missing."""
     measured = [trace for trace in traces if trace.role == "measured"] or traces
-    missing = np.zeros(len(time), dtype=bool)
+    missing = np.ones(len(time), dtype=bool)
     for trace in measured:
-        missing |= np.isnan(trace.values.reshape(len(time), -1)).any(axis=1)
+        missing &= np.isnan(trace.values.reshape(len(time), -1)).any(axis=1)
     gaps = sorted(_gaps(time, missing), key=lambda gap: gap[0] - gap[1])[:MAX_GAPS]
     column: dict[str, Any] = {"row": "all", "col": 1}
     for start, end in gaps:

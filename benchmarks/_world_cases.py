@@ -1,0 +1,225 @@
+"""The cases of the worlds bench: which robot, friction, noise, law and effect, from one seed."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import signal
+
+import jaxid
+
+from ._world_physics import (
+    EFFECTS,
+    FRICTIONS,
+    OUTSIDE,
+    ROBOTS,
+    TURNING,
+    Friction,
+    Hidden,
+    Robot,
+    draw_reference,
+    draw_robot,
+    draw_shape,
+)
+from ._world_simulation import Law, Signals, inertias, simulate
+
+KINDS = ("single", "double", "clean", "outside")
+LAWS = ("unknown", "sampled", "continuous")
+NOISES = ("white", "coloured", "heavy", "bursts")
+NAMES = ("fit_1", "fit_2", "held_out")
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a case is to be; `law` is what the user knows of the controller."""
+
+    number: int
+    kind: str
+    seed: int
+    effects: tuple[str, ...]
+    robot: str
+    friction: str
+    noise: str
+    law: str
+
+    @property
+    def label(self) -> str:
+        """For file names and tables."""
+        return f"{self.number:03d}_{self.law}_{self.kind}_{'+'.join(self.effects) or 'nothing'}"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A case as it was made; torques of the noise as they are in the recordings."""
+
+    robot: Robot
+    law: Law
+    hidden: tuple[Hidden, ...]
+    drawn: str
+    recordings: dict[str, dict[str, np.ndarray]]
+    # Size of the effect's torque and of the noise, root mean square on its joint.
+    strength: tuple[tuple[float, float], ...]
+
+
+def draw_wanted(master: int, count: int, laws: Sequence[str], robot: str = "any") -> list[Wanted]:
+    """`count` cases, each read with every law: six in ten with one effect, two of ten clean."""
+    rng = np.random.default_rng(master)
+    wanted = []
+    for number in range(count):
+        kind = KINDS[int(rng.choice(4, p=(0.6, 0.1, 0.2, 0.1)))]
+        chosen = str(rng.choice(ROBOTS)) if robot == "any" else robot
+        slides = {"axis": "all", "gantry": "all", "polar": "last"}.get(chosen)
+        known = [e for e in EFFECTS if slides != "all" or e not in TURNING]
+        strange = [e for e in OUTSIDE if chosen not in ("axis", "pendulum") or e != "cross_bump"]
+        size = {"single": 1, "double": 2, "clean": 0, "outside": 1}[kind]
+        names = rng.choice(strange if kind == "outside" else known, size, replace=False).tolist()
+        seed, friction, noise = (
+            int(rng.integers(1, 2**31)),
+            str(rng.choice(FRICTIONS)),
+            str(rng.choice(NOISES)),
+        )
+        wanted += [
+            Wanted(number, kind, seed, tuple(names), chosen, friction, noise, law) for law in laws
+        ]
+    return wanted
+
+
+def make(wanted: Wanted) -> Case:
+    """The case, simulated; the same for every law."""
+    rng = np.random.default_rng(wanted.seed)
+    robot = draw_robot(rng, wanted.robot)
+    m = inertias(robot)
+    rate, duration = int(rng.choice([200, 250, 500])), float(rng.uniform(10.0, 20.0))
+    pace = math.exp(rng.uniform(math.log(0.6), math.log(2.0)))
+    kinds = rng.permutation(["sines", "sines", "moves"]).tolist()
+    references = [draw_reference(rng, robot, duration, kind, pace) for kind in kinds]
+    speeds = [_speed(reference, duration) for reference in references]
+    speed = np.max(speeds, axis=0)
+    load = m * speed * 2 * math.pi * pace
+    frictions = tuple(
+        Friction(
+            viscous=float(load[j] / speed[j] * rng.uniform(0.05, 0.2)),
+            coulomb=float(load[j] * rng.uniform(0.1, 0.4)),
+            family=wanted.friction,
+            # Sharp enough that nobody sees it, to clearly rounded; stable at 0.1 ms.
+            width=float(speed[j] * math.exp(rng.uniform(math.log(0.002), math.log(0.03)))),
+        )
+        for j in range(len(m))
+    )
+    bandwidth = 2 * math.pi * rng.uniform(4.0, 9.0, len(m))
+    integral = float(rng.choice([0.0, 0.3]))
+    law = Law(
+        tuple((m * bandwidth**2).tolist()),
+        tuple((integral * m * bandwidth**3).tolist()),
+        tuple((1.4 * m * bandwidth).tolist()),
+        tuple(
+            link.travel * math.exp(rng.uniform(math.log(1e-7), math.log(3e-6)))
+            for link in robot.links
+        ),
+    )
+    clean = [simulate(robot, frictions, law, r, duration) for r in references[:1]]
+    level = rng.uniform(0.004, 0.02) * np.std(clean[0].tau, axis=0)
+    hidden = _hidden(rng, wanted, robot, frictions, speed, duration, clean[0], level)
+    runs = [simulate(robot, frictions, law, r, duration, hidden) for r in references]
+    recordings = {
+        name: _recorded(rng, run, rate, level, wanted.noise)
+        for name, run in zip(NAMES, runs, strict=True)
+    }
+    wrong = rng.uniform(0.8, 1.25, (len(m), 3))
+    strength = tuple(
+        (float(np.sqrt(np.mean(_along(e, runs[0]) ** 2))), float(level[e.joint])) for e in hidden
+    )
+    return Case(robot, law, hidden, robot.urdf(wrong), recordings, strength)
+
+
+def _speed(reference, duration: float) -> np.ndarray:
+    positions = np.array([reference.at(t) for t in np.arange(0.0, duration, 0.005)])
+    return np.abs(np.gradient(positions, 0.005, axis=0)).max(axis=0)
+
+
+def _along(effect: Hidden, run: Signals) -> np.ndarray:
+    """The effect's torque along a run, `(ticks,)`."""
+    effect.state = 0.0
+    size = effect.size or 1.0
+    rows = zip(run.time, run.q.tolist(), run.speed.tolist(), run.tau.tolist(), strict=True)
+    return np.array([size * effect.shape(t, q, v, tau, 1e-3) for t, q, v, tau in rows])
+
+
+def _hidden(rng, wanted, robot, frictions, speed, duration, clean, level) -> tuple[Hidden, ...]:
+    """The effects, each 3 to 12 times the noise before anything makes up for it."""
+    found = []
+    for name in wanted.effects:
+        places = [j for j, link in enumerate(robot.links) if not (link.slides and name in TURNING)]
+        j = int(rng.choice(places))
+        shape = draw_shape(rng, name, duration)
+        effect = Hidden(name, j, frictions[j], robot.links[j].travel, float(speed[j]), shape)
+        plain = np.sqrt(np.mean(_along(effect, clean) ** 2))
+        effect.size = float(level[j] * math.exp(rng.uniform(math.log(3), math.log(12))) / plain)
+        if name in ("asymmetric_friction", "friction_step", "thermal_drift", "load_dependent"):
+            effect.size *= float(rng.choice([-1.0, 1.0])) if name == "asymmetric_friction" else 1.0
+        found.append(effect)
+    return tuple(found)
+
+
+def _recorded(
+    rng: np.random.Generator, run: Signals, rate: int, level: np.ndarray, noise: str
+) -> dict[str, np.ndarray]:
+    """The run as it was logged: at `rate`, torque with noise of its own."""
+    every = 1000 // rate
+    tau = run.tau[::every]
+    errors = _noise(rng, tau.shape, noise) * level
+    return {
+        "time": run.time[::every],
+        "q": run.q[::every],
+        "tau": tau + errors,
+        "q_ref": run.q_ref[::every],
+        "noise": errors,
+    }
+
+
+def _noise(rng: np.random.Generator, shape: tuple[int, ...], kind: str) -> np.ndarray:
+    """Noise with a deviation of one."""
+    white = rng.standard_normal(shape)
+    if kind == "coloured":
+        pole = rng.uniform(0.5, 0.9)
+        return signal.lfilter([math.sqrt(1 - pole**2)], [1.0, -pole], white, axis=0)
+    if kind == "heavy":
+        return rng.standard_t(4.0, shape) / math.sqrt(2.0)
+    if kind == "bursts":
+        loud = np.repeat(rng.random((shape[0] // 50 + 1, 1)) < 0.1, 50, axis=0)[: shape[0]]
+        return white * np.where(loud, 2.5, 0.65)
+    return white
+
+
+def start_model(case: Case, law: str) -> jaxid.ClosedLoop:
+    """What a user would write: the drawing's URDF, bodies to be fitted, the law if it is known."""
+    known = case.law
+    pid = jaxid.control.PID(Kp=list(known.Kp), Ki=list(known.Ki), Kd=list(known.Kd))
+    controller = {
+        "unknown": None,
+        "continuous": pid,
+        "sampled": jaxid.control.Sampled(
+            pid,
+            every=0.001,
+            resolution=np.array(known.resolution),
+            velocity="difference",
+            cutoff=known.cutoff,
+        ),
+    }[law]
+    return jaxid.serial(case.drawn, controller, bodies="free")
+
+
+def read_case(folder: Path, case: Case) -> tuple[jaxid.Recordings, jaxid.Recordings]:
+    """The case as a user has it: CSV files, written and read; to fit and held out."""
+    folder.mkdir(parents=True, exist_ok=True)
+    n = len(case.robot.links)
+    for name, signals in case.recordings.items():
+        columns = ["time"] + [f"{s}_{j}" for s in ("q", "tau", "q_ref") for j in range(1, n + 1)]
+        table = np.column_stack([signals[s] for s in ("time", "q", "tau", "q_ref")])
+        np.savetxt(
+            folder / f"{name}.csv", table, "%.8g", ",", header=",".join(columns), comments=""
+        )
+    fitting = jaxid.read(folder / "fit_1.csv", folder / "fit_2.csv")
+    return jaxid.Recordings.of(fitting), jaxid.Recordings.of(jaxid.read(folder / "held_out.csv"))

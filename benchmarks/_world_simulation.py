@@ -1,0 +1,108 @@
+"""A drawn robot under a sampled law, simulated by MuJoCo at 0.1 ms."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from ._world_physics import Friction, Hidden, Reference, Robot
+
+STEP = 1e-4
+TICK = 10  # steps
+
+
+@dataclass(frozen=True)
+class Law:
+    """PD with an integral if wanted, at 1 kHz, from encoders, velocity by low-passed difference."""
+
+    Kp: tuple[float, ...]
+    Ki: tuple[float, ...]
+    Kd: tuple[float, ...]
+    resolution: tuple[float, ...]
+    cutoff: float = 150.0
+
+
+@dataclass(frozen=True)
+class Signals:
+    """What a simulation gives at 1 kHz: `(ticks, joints)`; `speed` and `drive` without errors."""
+
+    time: np.ndarray
+    q: np.ndarray
+    tau: np.ndarray
+    q_ref: np.ndarray
+    speed: np.ndarray
+
+
+def loaded(robot: Robot, frictions: Sequence[Friction]) -> mujoco.MjModel:
+    """MuJoCo's model of the robot, with rotors, and dry friction where the family asks for it."""
+    model = mujoco.MjModel.from_xml_string(robot.urdf())
+    model.opt.timestep = STEP
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model.jnt_limited[:] = 0
+    model.dof_armature[:] = [link.rotor for link in robot.links]
+    model.dof_damping[:] = [f.viscous for f in frictions]
+    model.dof_frictionloss[:] = [f.coulomb if f.family == "dry" else 0.0 for f in frictions]
+    return model
+
+
+def inertias(robot: Robot) -> np.ndarray:
+    """Diagonal of the mass matrix at rest, `(joints,)`."""
+    plain = [Friction(0.0, 0.0, "tanh", 1.0)] * len(robot.links)
+    model = loaded(robot, plain)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    columns = np.zeros((model.nv, model.nv))
+    for j, unit in enumerate(np.eye(model.nv)):
+        mujoco.mj_mulM(model, data, columns[j], unit)
+    return np.diag(columns).copy()
+
+
+def simulate(
+    robot: Robot,
+    frictions: Sequence[Friction],
+    law: Law,
+    reference: Reference,
+    duration: float,
+    hidden: Sequence[Hidden] = (),
+) -> Signals:
+    """A run from rest: commanded torque is held between ticks, and acts at once."""
+    model = loaded(robot, frictions)
+    data = mujoco.MjData(model)
+    n = len(robot.links)
+    for effect in hidden:
+        effect.state = 0.0
+    ticks = round(duration * 1000)
+    rows: dict[str, list] = {"q": [], "tau": [], "q_ref": [], "speed": []}
+    before, speed, integral = [0.0] * n, [0.0] * n, [0.0] * n
+    smooth = 1.0 - math.exp(-2 * math.pi * law.cutoff * STEP * TICK)
+    period = STEP * TICK
+    for k in range(ticks):
+        asked = reference.at(k * period)
+        ahead = reference.at((k + 1) * period)
+        q = [round(x / r) * r for x, r in zip(data.qpos.tolist(), law.resolution, strict=True)]
+        tau = [0.0] * n
+        for j in range(n):
+            speed[j] += smooth * ((q[j] - before[j]) / period - speed[j])
+            error = asked[j] - q[j]
+            integral[j] += error * period
+            rate = (ahead[j] - asked[j]) / period - speed[j]
+            tau[j] = law.Kp[j] * error + law.Ki[j] * integral[j] + law.Kd[j] * rate
+        before = q
+        for name, row in (("q", q), ("tau", tau), ("q_ref", asked)):
+            rows[name].append(row)
+        rows["speed"].append(data.qvel.tolist())
+        for step in range(TICK):
+            t, at, v = k * period + step * STEP, data.qpos.tolist(), data.qvel.tolist()
+            acting = list(tau)
+            for j, friction in enumerate(frictions):
+                acting[j] -= friction.coulomb * friction.sign(v[j])
+            for effect in hidden:
+                acting[effect.joint] -= effect.size * effect.shape(t, at, v, tau, STEP)
+            data.qfrc_applied[:] = acting
+            mujoco.mj_step(model, data)
+    arrays = {name: np.array(row) for name, row in rows.items()}
+    if not all(np.isfinite(x).all() for x in arrays.values()):
+        raise ValueError(f"the simulation of {robot.name} diverged")
+    return Signals(np.arange(ticks) * period, **arrays)

@@ -1,0 +1,201 @@
+"""The worlds bench: robots that MuJoCo simulates, with physics and laws that jaxid does not have.
+
+Robots of one and two joints are drawn (planar, SCARA, polar, gantry, axis, pendulum) with the
+friction's sign by tanh, a root, arctan or dry, a law held at 1 kHz from quantised encoders, and
+noise that is white, coloured, heavy-tailed or in bursts. The user has a URDF whose bodies are wrong
+by up to a quarter, and knows the law as sampled, takes it for continuous, or does not know it.
+
+python -m benchmarks.worlds [--seed N] [--quick] [--count 40] [--law unknown|sampled|continuous|any]
+                            [--robot NAME] [--jobs 2] [--out DIR] [--json FILE] [--case N]
+"""
+
+import argparse
+import json
+import secrets
+import tempfile
+import time
+import traceback
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxid
+from jaxid.storage.campaign import Campaign, Failed
+
+from ._world_cases import KINDS, LAWS, Case, Wanted, draw_wanted, make, read_case, start_model
+from ._world_floor import floor_percent
+from ._world_physics import ROBOTS
+from .hidden_effects import configure_jax
+
+
+def run_case(wanted: Wanted) -> dict[str, Any]:
+    """Makes, solves and judges one case."""
+    started = time.perf_counter()
+    try:
+        record = _solve(wanted)
+    except Exception:
+        record = {"error": traceback.format_exc()}
+    return {**asdict(wanted), **record, "seconds": time.perf_counter() - started}
+
+
+def _solve(wanted: Wanted) -> dict[str, Any]:
+    case = make(wanted)
+    with tempfile.TemporaryDirectory() as folder:
+        fitting, held_out = read_case(Path(folder), case)
+    started, cpu = time.perf_counter(), time.process_time()
+    start = start_model(case, wanted.law)
+    found = jaxid.discover(start, fitting, validate=held_out, progress=False)
+    took = {"took": time.perf_counter() - started, "cpu": time.process_time() - cpu}
+    story = found.to_dict()
+    floor = floor_percent(case, held_out, found.loop)
+    return {
+        "truth": [
+            {"effect": e.name, "joint": e.joint + 1, "size": e.size, **e.drawn} for e in case.hidden
+        ],
+        "strength": case.strength,
+        "floor": floor.tolist(),
+        "story": {**story, **took},
+        "marks": judge(case, wanted.kind, story, floor),
+    }
+
+
+def judge(case: Case, kind: str, story: dict[str, Any], floor: np.ndarray) -> dict[str, Any]:
+    """What was right of a story.
+
+    Named is an effect that was added, or that shares the weight with one that was.
+    """
+    groups = [
+        [(a["effect"], a["joint"])] + [(i["effect"], i["joint"]) for i in a["indistinguishable"]]
+        for a in story["added"]
+    ]
+    true = [(e.name, e.joint + 1) for e in case.hidden]
+    after = np.array(story["error_percent"]["after"]["validate"])
+    ratio = float((after / floor).max())
+    sure = story["verdict"] in ("adequate", "explained")
+    marks: dict[str, Any] = {"verdict": story["verdict"], "ratio": ratio, "sure": sure}
+    if kind == "clean":
+        return {**marks, "right": story["verdict"] == "adequate", "alarm": bool(groups)}
+    if kind == "outside":
+        return {**marks, "right": not sure, "recognised": story["verdict"] == "outside_catalogue"}
+    marks["first"] = bool(groups) and groups[0][0] in true
+    marks["named"] = [any(t in group for group in groups) for t in true]
+    marks["extra"] = sum(not any(t in group for t in true) for group in groups)
+    marks["wrong_and_sure"] = sum(
+        not any(t in group for t in true) and (a["probability"] or 0) > 0.9
+        for a, group in zip(story["added"], groups, strict=True)
+    )
+    return {**marks, "right": all(marks["named"])}
+
+
+def row(record: dict[str, Any]) -> str:
+    """One line of the table."""
+    head = f"{record['number']:3d} {record['law']:11s}{record['kind']:8s}{record['robot']:9s}"
+    head += f"{record['friction']:7s}{record['noise']:9s}"
+    if "error" in record:
+        return f"{head}ERROR {record['error'].strip().splitlines()[-1][:150]}"
+    truth = " + ".join(f"{t['effect']}({t['joint']})" for t in record["truth"]) or "-"
+    found = " + ".join(f"{a['effect']}({a['joint']})" for a in record["story"]["added"]) or "-"
+    marks = record["marks"]
+    state = (
+        "ok" if marks["right"] and not marks.get("extra") else "part" if marks["right"] else "NO"
+    )
+    return (
+        f"{head}{truth:44s}{state:5s}{marks['ratio']:7.2f}{record['story']['cpu']:6.0f} s  "
+        f"{marks['verdict']}: {found}"
+    )
+
+
+def summary(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Scores by law: (right, of)."""
+    table: dict[str, Any] = {}
+    for law in dict.fromkeys(r["law"] for r in records):
+        done = [r for r in records if r["law"] == law and "marks" in r]
+        of = {kind: [r["marks"] for r in done if r["kind"] == kind] for kind in KINDS}
+        effects = [*of["single"], *of["double"]]
+        named = [n for m in effects for n in m["named"]]
+        sure = [r["marks"]["ratio"] for r in done if r["marks"]["sure"]]
+        ratios = sorted(r["marks"]["ratio"] for r in done)
+        table[law] = {
+            "one effect: named": (sum(m["right"] for m in of["single"]), len(of["single"])),
+            "one effect: first": (sum(m["first"] for m in of["single"]), len(of["single"])),
+            "effects named, each counted": (sum(named), len(named)),
+            "whole set named and nothing else": (
+                sum(m["right"] and not m["extra"] for m in effects),
+                len(effects),
+            ),
+            "with an addition that is wrong and sure": (
+                sum(m["wrong_and_sure"] > 0 for m in effects),
+                len(effects),
+            ),
+            "clean: left alone": (sum(m["right"] for m in of["clean"]), len(of["clean"])),
+            "clean: something added": (sum(m["alarm"] for m in of["clean"]), len(of["clean"])),
+            "outside: not called explained": (
+                sum(m["right"] for m in of["outside"]),
+                len(of["outside"]),
+            ),
+            "outside: recognised": (
+                sum(m["recognised"] for m in of["outside"]),
+                len(of["outside"]),
+            ),
+            "undetermined": (
+                sum(r["marks"]["verdict"] == "undetermined" for r in done),
+                len(done),
+            ),
+            "adequate or explained above 1.3 of the floor": (
+                sum(x > 1.3 for x in sure),
+                len(sure),
+            ),
+            "held out over floor, median and worst": (
+                float(np.median(ratios)) if ratios else None,
+                ratios[-3:],
+            ),
+            "CPU seconds, median": float(np.median([r["story"]["cpu"] for r in done] or [0])),
+            "errors": [r["number"] for r in records if r["law"] == law and "error" in r],
+        }
+    return table
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs the bench; see the module's first lines."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, help="of everything; drawn anew if not given")
+    parser.add_argument("--quick", action="store_true", help="two cases of one joint")
+    parser.add_argument("--count", type=int, default=40)
+    parser.add_argument("--law", choices=(*LAWS, "any"), default="unknown")
+    parser.add_argument("--robot", choices=(*ROBOTS, "any"), default="any")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path, help="folder in which a stopped run continues")
+    parser.add_argument("--json", type=Path, help="file for all results")
+    parser.add_argument("--case", type=int, action="append", help="only the case of this number")
+    given = parser.parse_args(arguments)
+    seed = secrets.randbits(31) if given.seed is None else given.seed
+    laws = LAWS if given.law == "any" else (given.law,)
+    count, robot = (2, "axis") if given.quick else (given.count, given.robot)
+    cases = draw_wanted(seed, count, laws, robot)
+    cases = [w for w in cases if given.case is None or w.number in given.case]
+    out = given.out or Path(tempfile.mkdtemp(prefix="worlds_"))
+    print(f"seed {seed}, {len(cases)} cases, results in {out}", flush=True)
+    configure_jax()
+    records = []
+    wanted = {case.label: case for case in cases}
+    with Campaign(out, {"seed": seed, "robot": robot}) as campaign:
+        for label, record in campaign.run(run_case, wanted, jobs=given.jobs):
+            if isinstance(record, Failed):
+                record = {**asdict(wanted[label]), "error": record.reason}
+            print(row(record), flush=True)
+            records.append(record)
+    scores = summary(records)
+    for law, lines in scores.items():
+        print(f"\nlaw {law}")
+        for name, value in lines.items():
+            print(f"  {name:48s}{value}")
+    if given.json is not None:
+        content = {"seed": seed, "scores": scores, "cases": records}
+        given.json.write_text(json.dumps(content, indent=1, default=float) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""Values that a model holds by default: the smoothing of a sign, its form, a delay of the torque.
+
+Torque is that of inverse dynamics written out here, along motions in closed form.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxid
+from jaxid.control import Tracking
+from jaxid.discovery.predict import Predictor
+from jaxid.discovery.release import doubtful, released
+from jaxid.discovery.system import System
+from jaxid.effects import Coulomb, TorqueOffset, Viscous, smooth_sign
+from jaxid.noise import ARFilter
+
+MASS, DRAG, DRY, STIFF = 5.0, 4.0, 3.0, 8.0
+
+
+def test_a_smoothed_sign_is_a_half_at_its_smoothing_and_a_sign_at_none():
+    v = jnp.array([-0.3, -0.02, 0.02, 0.3])
+    for form in (0.0, 0.4, 1.0):
+        half = smooth_sign(jnp.asarray(0.02), jnp.asarray(0.02), jnp.asarray(form))
+        assert float(half) == pytest.approx(0.5, rel=1e-12)
+        sharp = smooth_sign(v, jnp.asarray(0.0), jnp.asarray(form))
+        np.testing.assert_allclose(sharp, np.sign(v), atol=1e-12)
+        assert float(smooth_sign(jnp.asarray(0.0), jnp.asarray(0.0), jnp.asarray(form))) == 0
+    # At its bound the derivative is that of arctan2: a search that went there finds the way back.
+    slope = jax.grad(lambda eps: smooth_sign(jnp.asarray(0.02), eps))(0.0)
+    assert float(slope) == pytest.approx(-2 / np.pi / 0.02, rel=1e-9)
+
+
+def axis(smoothing=0.01):
+    effects = Viscous(1, 1.0), Coulomb(1, 1.0, smoothing=smoothing), TorqueOffset(1)
+    return jaxid.ClosedLoop(jaxid.arms.Axis(M=MASS), Tracking(cutoff=20.0), effects, name="axis")
+
+
+def recorded(seed, sign, spring=0.0, late=0.0, noise=0.01):
+    """An axis moved by sines, its torque that of the motion `late` s later."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, 12.0, 0.004)
+    rates = 2 * np.pi * np.array([0.23, 0.61, 1.3]) * rng.uniform(0.9, 1.1, 3)
+    sizes, phases = np.array([0.08, 0.03, 0.01]), rng.uniform(0, 6, 3)
+
+    def motion(t, order):
+        turned = t[:, None] * rates + phases + order * np.pi / 2
+        return (sizes * rates**order * np.sin(turned)).sum(axis=1)
+
+    q, v, a = (motion(time + late, k) for k in range(3))
+    tau = MASS * a + DRAG * v + DRY * sign(v) + spring * q
+    tau = tau + noise * rng.standard_normal(len(time))
+    return jaxid.Recording.from_arrays(time, motion(time, 0), tau, name=f"run_{seed}")
+
+
+def tanh(v):
+    return np.tanh(v / 0.004)
+
+
+def arctan(v):
+    return 2 / np.pi * np.arctan(v / 0.01)
+
+
+def predictor(recordings, loop=None):
+    fit = jaxid.fit(loop or axis(), recordings, jaxid.OEM(progress=False))
+    system = System.of(fit)
+    noise = [ARFilter(np.zeros(0), float(np.var(system.residual[system.mask])))]
+    return Predictor.of(system, noise)
+
+
+def test_held_values_are_in_doubt_unless_a_user_held_them():
+    assert [p.name for p in doubtful(axis())] == ["eps1", "form1"]
+    assert [p.name for p in doubtful(axis().free("eps1"))] == ["form1"]
+    assert [p.name for p in doubtful(axis().hold("form1"))] == ["eps1"]
+
+
+def test_nothing_is_released_where_the_default_is_right():
+    assert released(predictor([recorded(1, arctan), recorded(2, arctan)]), 20.0) is None
+
+
+def test_a_wrong_smoothing_is_released():
+    found = released(predictor([recorded(1, tanh), recorded(2, tanh)]), 20.0)
+    assert found is not None
+    assert "eps1" in found.loop.names
+    fit = jaxid.fit(found.loop.free("form1"), [recorded(1, tanh)], jaxid.OEM(progress=False))
+    table = fit.table()
+    # tanh is a half where its argument is artanh(1/2).
+    assert table.loc["eps1", "value"] == pytest.approx(0.004 * np.arctanh(0.5), rel=0.02)
+    assert table.loc["form1", "value"] > 0.95
+    assert table.loc["Fc1", "value"] == pytest.approx(DRY, rel=0.01)
+
+
+def test_a_delay_of_the_torque_is_released():
+    late = 0.003
+    runs = [recorded(k, arctan, late=late) for k in (1, 2)]
+    found = released(predictor(runs), 20.0)
+    assert found is not None
+    assert found.freedom == 1
+    assert found.loop.controller.delay == pytest.approx(late, rel=0.1)
+
+
+@pytest.mark.slow
+def test_another_friction_curve_is_no_further_effect():
+    """A spring in an axis whose sign of velocity is a tanh: the spring alone is added."""
+    runs = [recorded(k, tanh, spring=STIFF) for k in (3, 4)]
+    unseen = recorded(5, tanh, spring=STIFF)
+    story = jaxid.discover(axis(), runs, validate=unseen, progress=False)
+    assert story.verdict == "explained"
+    assert [(a["effect"], a["joint"]) for a in story.to_dict()["added"]] == [("spring", 1)]
+    assert any("eps1 was estimated" in note for note in story.notes)
+    with pytest.raises(jaxid.errors.RecordingError, match="what judges a model"):
+        jaxid.discover(axis(), runs, validate=runs[0], progress=False)
+
+
+def test_where_a_joint_stands_still_its_torque_is_not_compared():
+    time = np.arange(0.0, 8.0, 0.005)
+    q = 0.2 * np.clip(time - 1, 0, 2) - 0.1 * np.clip(time - 5, 0, 1)
+    moving = (time > 1) & (time < 3) | (time > 5) & (time < 6)
+    held = 2.0 * np.sin(time) * ~moving  # what friction lets the drive do at rest
+    tau = np.sign(np.gradient(q)) * 1.0 * moving + held
+    record = jaxid.Recording.from_arrays(time, q, tau + 1e-3 * np.cos(40 * time))
+    found = Tracking(cutoff=20.0).moving(record, 20.0)
+    assert found is not None
+    away = np.abs(time[:, None] - [1, 3, 5, 6]).min(axis=1) > 0.1
+    np.testing.assert_array_equal(found[away, 0], moving[away])
+    assert Tracking(still=0.0).moving(record, 20.0) is None
+    law = Tracking(cutoff=20.0)
+    loop = jaxid.ClosedLoop(jaxid.arms.Axis(), law, (Viscous(1), Coulomb(1)), name="axis")
+    fit = jaxid.fit(loop, record, jaxid.OEM(progress=False))
+    still = np.mean(np.concatenate(fit.residuals) == 0)
+    assert 0.5 < still < 0.7
