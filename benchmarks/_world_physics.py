@@ -177,7 +177,9 @@ class Hidden:
             case "quadratic_drag":
                 return w * abs(w)
             case "load_dependent_friction":
-                return abs(tau[j]) * sign
+                # By the torque that reaches the link.
+                f = self.friction
+                return abs(tau[j] - f.coulomb * sign - f.viscous * w) * sign
             case "position_dependent_friction":
                 return sign * math.cos(d["turns"] * math.pi * x + d["phase"])
             case "hysteresis":

@@ -44,6 +44,8 @@ from .estimate import deviations as deviations  # noqa: E402
 from .estimate import fit as fit  # noqa: E402
 from .estimate import profile as profile  # noqa: E402
 from .estimate import with_deviations as with_deviations  # noqa: E402
+from .exporting import write_mjcf as write_mjcf  # noqa: E402
+from .exporting import write_urdf as write_urdf  # noqa: E402
 from .parameters import parameter as parameter  # noqa: E402
 from .recording import Recording as Recording  # noqa: E402
 from .recording import Recordings as Recordings  # noqa: E402
@@ -71,9 +73,12 @@ if _TYPE_CHECKING:
     from .discovery import Comparison as Comparison
     from .discovery import Diagnosis as Diagnosis
     from .discovery import Discovery as Discovery
+    from .discovery import Fleet as Fleet
+    from .discovery import FleetRobot as FleetRobot
     from .discovery import compare as compare
     from .discovery import diagnose as diagnose
     from .discovery import discover as discover
+    from .discovery import discover_all as discover_all
     from .discovery import next_experiment as next_experiment
     from .excitation import Excitation as Excitation
     from .excitation import Limits as Limits
@@ -88,9 +93,12 @@ _LATER = {
         "Comparison",
         "Diagnosis",
         "Discovery",
+        "Fleet",
+        "FleetRobot",
         "compare",
         "diagnose",
         "discover",
+        "discover_all",
         "next_experiment",
     ),
     "excitation": ("Excitation", "Limits", "PlanarReach", "optimal_excitation"),

@@ -135,7 +135,7 @@ def test_a_fit_that_failed_ends_with_one(monkeypatch, tmp_path):
         (["fit", FIT_1], "no robot is named"),
         (["compare", FIT_1], "no robot is named"),
         (["fit", FIT_1, *SCARA, "--log", "absent.toml"], "jaxid inspect --write makes one"),
-        (["fit", FIT_1, *SCARA, "--gaps", "maybe"], "give refuse or allow"),
+        (["fit", FIT_1, *SCARA, "--log", FIT_1], "no TOML"),
         (["fit", FIT_1, *SCARA, "--unit", "q=deg,deg,deg"], "3 units for q of 2 joints"),
         (["fit", FIT_1, "--robot", "delta"], "there is no robot 'delta': choose scara"),
         (["fit", FIT_1, "--robot", "absent.py:loop"], "there is no file absent.py"),

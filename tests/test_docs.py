@@ -6,6 +6,7 @@ import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
@@ -118,6 +119,7 @@ def test_code_of_bring_your_own_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     Path("arm.urdf").write_text(three_joints(), encoding="utf-8")
     asked: list[Any] = []
     monkeypatch.setattr(jaxid, "read", lambda *files, **given: asked.append(given))
+    monkeypatch.setattr(jaxid, "fit", lambda loop, _: SimpleNamespace(loop=loop))
     monkeypatch.setattr(jaxid, "discover", lambda *args, **given: asked.append(given))
     text = (DOCS / "your-own.md").read_text(encoding="utf-8")
     own: dict[str, Any] = {"jaxid": jaxid, "recordings": None, "G": np.eye(3)}

@@ -27,7 +27,7 @@ FLOORS = (
         "signals",
         "storage",
     },
-    {"robots", "simulation"},
+    {"exporting", "robots", "simulation"},
     {"estimate", "excitation", "noise"},
     {"discovery"},
     {"cli", "report"},

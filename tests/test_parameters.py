@@ -59,7 +59,7 @@ class Box(eqx.Module):
 def test_names_are_symbols_with_the_joint_in_the_order_of_the_fields():
     names = [p.name for p in jaxid.scara().parameters]
     arm = ["ZZ1r", "ZZ2", "MX2", "MY2"]
-    assert names == [*arm, "Fv1", "Fc1", "eps1", "Fv2", "Fc2", "eps2"]
+    assert names == [*arm, "Fv1", "Fc1", "eps1", "form1", "Fv2", "Fc2", "eps2", "form2"]
     assert jaxid.scara().names == (*arm, "Fv1", "Fc1", "Fv2", "Fc2")
     assert [p.joint for p in jaxid.scara().parameters][3:6] == [None, 1, 1]
 
@@ -135,7 +135,14 @@ def test_units_of_joints_that_slide():
     assert sliding_unit("N·m/(rad/s)") == "N/(m/s)"
     loop = jaxid.emps()
     units = {p.name: loop.unit(p) for p in loop.parameters}
-    assert units == {"M": "kg", "Fv1": "N·s/m", "Fc1": "N", "eps1": "m/s", "offset1": "N"}
+    assert units == {
+        "M": "kg",
+        "Fv1": "N·s/m",
+        "Fc1": "N",
+        "eps1": "m/s",
+        "form1": "1",
+        "offset1": "N",
+    }
     assert jaxid.scara().unit(jaxid.scara().parameters[4]) == "N·m·s/rad"
 
 

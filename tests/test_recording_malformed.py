@@ -99,7 +99,7 @@ def test_a_cell_that_is_no_number(
     frame.loc[row, column] = cell
     message = refused(tmp_path, ending, encode(frame, ending))
     assert column in message
-    assert f"row {row + 1} " in message
+    assert f"line {row + 2} " in message
 
 
 @examples(60)
@@ -110,7 +110,8 @@ def test_a_value_that_is_not_finite(
     frame = table()
     frame.loc[row, column] = value
     message = refused(tmp_path, ending, encode(frame, ending))
-    assert f"{column}, row {row + 1} " in message
+    where = f"line {row + 2}" if ending in TEXT else f"row {row + 1}"
+    assert f"{column}, {where} " in message
 
 
 @examples(60)
@@ -165,7 +166,7 @@ def test_a_signal_that_does_not_move(tmp_path: Path, ending: str, column: str, v
 def test_a_row_of_another_length(tmp_path: Path, ending: str, row: int, cells: int) -> None:
     lines = encode(table(), ending).decode().splitlines()
     lines[row + 1] = ",".join(["1.5"] * cells)
-    assert f"row {row + 1} " in refused(tmp_path, ending, "\n".join(lines).encode())
+    assert f"line {row + 2} " in refused(tmp_path, ending, "\n".join(lines).encode())
 
 
 @examples(20)

@@ -46,7 +46,7 @@ def test_score_of_white_noise_is_its_likelihood_and_the_price():
 def test_score_of_coloured_noise_pays_for_its_filter():
     rng = np.random.default_rng(4)
     white = rng.standard_normal((1, 4000, 1))
-    rest = np.zeros_like(white)
+    rest = np.copy(white)
     for k in range(1, 4000):
         rest[:, k] = 0.9 * rest[:, k - 1] + white[:, k]
     found = score(data_of(rest), rest, freedom=0, size=0, offered=10)

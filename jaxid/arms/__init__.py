@@ -5,6 +5,8 @@ from ._base import Split as Split
 from .axis import Axis as Axis
 from .chain import BODY as BODY
 from .chain import Chain as Chain
+from .physical import PhysicalBodies as PhysicalBodies
+from .physical import physical_bodies as physical_bodies
 from .scara import SCARA as SCARA
 from .serial import SerialArm as SerialArm
 from .two_link import TwoLink as TwoLink

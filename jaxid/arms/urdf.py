@@ -36,11 +36,21 @@ class Described(eqx.Module):
     - `name`: of the robot. `joints`: those that move, from the base on.
     - `bodies`: ten parameters of each joint's link and all that is fixed to it, `(joints, 10)`, in
       the link's frame and the order of `jaxid.arms.BODY`.
+    - `carried`: names of the links whose bodies these are.
     """
 
     name: str = eqx.field(static=True)
     joints: tuple[DescribedJoint, ...]
     bodies: Float[np.ndarray, "joints 10"]
+    carried: tuple[str, ...] = eqx.field(static=True, default=())
+
+
+def parsed_urdf(source: str | os.PathLike[str]) -> Any:
+    """The document of a URDF, path or text, as an `ElementTree` element.
+
+    **Raises:** `ModelError` for a file that cannot be read or is no URDF.
+    """
+    return _parsed(source)[0]
 
 
 def read_urdf(
@@ -79,9 +89,9 @@ def read_urdf(
         raise ModelError(
             f"{where} has no joint that moves between {base!r} and {tip!r}: name other links"
         )
-    bodies = _bodies(links, parents, owner, base, len(joints), where)
+    bodies, carried = _bodies(links, parents, owner, base, len(joints), where)
     _check_masses(bodies, joints, where)
-    return Described(root.get("name") or "robot", tuple(joints), bodies)
+    return Described(root.get("name") or "robot", tuple(joints), bodies, carried)
 
 
 # --- the tree -----------------------------------------------------------------------------------
@@ -274,9 +284,9 @@ def _bodies(
     base: str,
     count: int,
     where: str,
-) -> Float[np.ndarray, "joints 10"]:
-    """The bodies of the chain's links, with all that hangs on them."""
-    found = np.zeros((count, 10))
+) -> tuple[Float[np.ndarray, "joints 10"], tuple[str, ...]]:
+    """The bodies of the chain's links, with all that hangs on them, and whose they are."""
+    found, carried = np.zeros((count, 10)), []
     for link, element in links.items():
         frame, at = (np.eye(3), np.zeros(3)), link
         while at not in owner and at != base and at in parents:
@@ -291,7 +301,8 @@ def _bodies(
         if inertial is not None:
             frame = turn @ frame[0], place + turn @ frame[1]
             found[number] += _body(inertial, frame, f"link {link!r} in {where}")
-    return found
+            carried.append(link)
+    return found, tuple(carried)
 
 
 def _body(

@@ -7,6 +7,7 @@ import typer
 from .discovering import Spread, demo, discover
 from .ending import INTERRUPTED, leave, leave_on_interrupt
 from .fitting import compare, fit
+from .fleets import discover_all
 from .inspecting import diagnose, inspect
 
 ABOUT = """Identify robot arms from closed-loop recordings, and find the effect the model lacks.
@@ -44,6 +45,7 @@ app.command()(fit)
 app.command()(compare)
 app.command()(diagnose)
 app.command(cls=Spread)(discover)
+app.command()(discover_all)
 app.command()(demo)
 
 

@@ -13,7 +13,7 @@ from typer.core import TyperCommand
 
 from ..errors import RecordingError
 from .ending import UNDETERMINED, sentences
-from .files import Reading, check_outputs, write_json
+from .files import ReadOptions, check_outputs, write_json
 from .models import load_effect, load_robot, with_controller, without
 from .options import (
     Catalogue,
@@ -129,7 +129,7 @@ def discover(
     with journal, sentences(journal.farewell):
         check_outputs(json_file, report, save)
         loop = with_controller(load_robot(robot), controller)
-        reading = Reading(column, unit, log, gaps, clock, drop_nan)
+        reading = ReadOptions(column, unit, log, gaps, clock, drop_nan)
         own = [load_effect(given) for given in catalogue or ()]
         held_out = list(validate or [])
         _check_apart(files, held_out)

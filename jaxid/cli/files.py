@@ -12,7 +12,7 @@ import equinox as eqx
 from ..errors import ModelError, near
 
 
-class Reading(eqx.Module):
+class ReadOptions(eqx.Module):
     """How files are read: the options that say what is in them."""
 
     column: list[str] | None = None

@@ -7,7 +7,7 @@ import typer
 
 from ..errors import ModelError
 from .ending import sentences
-from .files import Reading, check_outputs, write_json
+from .files import ReadOptions, check_outputs, write_json
 from .models import load_effect, load_robot, saved_model, with_controller
 from .options import (
     METHODS,
@@ -73,7 +73,7 @@ def fit(
         if window is not None and method not in ("oem", "pem"):
             raise ModelError(f"--method {method} simulates nothing in windows: leave out --window")
         loop = with_controller(load_robot(robot), controller)
-        reading = Reading(column, unit, log, gaps, clock, drop_nan)
+        reading = ReadOptions(column, unit, log, gaps, clock, drop_nan)
         found = estimate.fit(loop, reading(files), methods[method]())
         typer.echo(repr(found).partition("\n")[0] if quiet else repr(found))
         write_json(json_file, found.to_dict())
@@ -123,7 +123,7 @@ def compare(
         own = frozenset(e for e in map(load_effect, catalogue or ()) if isinstance(e, type))
         loop = saved_model(robot, values, own)
         loop = with_controller(loop, controller)
-        reading = Reading(column, unit, log, gaps, clock, drop_nan)
+        reading = ReadOptions(column, unit, log, gaps, clock, drop_nan)
         result = run_compare(loop, reading(files), window=window)
         errors = ", ".join(f"{name} {x:.3f} %" for name, x in pooled(result).items())
         typer.echo(f"{result.loop.name}: {errors}" if quiet else repr(result))

@@ -10,7 +10,7 @@ import typer
 
 from ..errors import RecordingError
 from .ending import sentences
-from .files import Reading, check_outputs, described, write_json
+from .files import ReadOptions, check_outputs, described, write_json
 from .models import load_effect, load_robot, with_controller
 from .options import (
     Catalogue,
@@ -69,7 +69,7 @@ def inspect(
 
     with sentences():
         check_outputs(json_file, write, plot)
-        reading = Reading(column, unit, log, gaps, clock, drop_nan)
+        reading = ReadOptions(column, unit, log, gaps, clock, drop_nan)
         guessed: dict[str, Any] = {}
         try:
             recordings = reading(files)
@@ -82,7 +82,7 @@ def inspect(
             typer.echo(f"not read as they are: {error}")
             told = [f"{k}={v if isinstance(v, str) else ','.join(v)}" for k, v in guessed.items()]
             typer.echo(f"taken for now: {'  '.join(told)}")
-            recordings = Reading(told, unit, log, gaps, clock, drop_nan)(files)
+            recordings = ReadOptions(told, unit, log, gaps, clock, drop_nan)(files)
         found = look(recordings)
         typer.echo(repr(found))
         write_json(json_file, found.to_dict())
@@ -131,7 +131,7 @@ def guess(names: Sequence[str]) -> dict[str, Any]:
     return {k: v for k, v in found.items() if k == "time" or len(v) == joints}
 
 
-def description(reading: Reading, guessed: dict[str, Any], joints: int) -> str:
+def description(reading: ReadOptions, guessed: dict[str, Any], joints: int) -> str:
     """A TOML file that says how these files are read, with what else may be said in it."""
     told = {} if reading.log is None else described(reading.log)
     columns = told.get("columns", {}) | guessed
@@ -186,7 +186,7 @@ def diagnose(
         check_outputs(json_file)
         loop = with_controller(load_robot(robot), controller)
         own = [load_effect(given) for given in catalogue or ()]
-        reading = Reading(column, unit, log, gaps, clock, drop_nan)
+        reading = ReadOptions(column, unit, log, gaps, clock, drop_nan)
         fitted = fit(loop, reading(files), OEM(progress=not quiet))
         found = run_diagnose(fitted, catalogue=(*known, *own), progress=not quiet)
         typer.echo(repr(found).partition("\n")[0] if quiet else f"{fitted!r}\n\n{found!r}")

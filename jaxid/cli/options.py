@@ -1,7 +1,7 @@
 """Options that several commands have."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -31,9 +31,12 @@ Log = Annotated[
     typer.Option("--log", help="Columns and units in a TOML file, as jaxid inspect --write does."),
 ]
 Gaps = Annotated[
-    str, typer.Option(help="refuse or allow: missing stretches of time in a recording.")
+    Literal["refuse", "allow"], typer.Option(help="Missing stretches of time in a recording.")
 ]
-Clock = Annotated[str, typer.Option(help="recorded, or even where the times of a logger jitter.")]
+Clock = Annotated[
+    Literal["recorded", "even"],
+    typer.Option(help="Times as recorded, or even where those of a logger jitter."),
+]
 DropNan = Annotated[
     bool, typer.Option("--drop-nan", help="Leave out samples at which a signal is empty.")
 ]

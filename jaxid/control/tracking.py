@@ -36,7 +36,7 @@ class Tracking(AbstractController):
       noise, and once fitted the lowest of these.
     - `still`: share of its highest speed below which a joint stands still. Friction holds it then
       with any torque up to that of breaking away, which no motion tells, so neither then nor within
-      half a period of the cutoff is its torque compared; nil compares it all.
+      a period of the cutoff is its torque compared; nil compares it all.
     """
 
     bandwidth: float = 40.0
@@ -86,8 +86,8 @@ class Tracking(AbstractController):
         turns = speed[1:] * speed[:-1] < 0
         standing[1:] |= turns
         standing[:-1] |= turns
-        half = max(1, round(recording.rate / cutoff / 2))
-        return ~scipy.ndimage.binary_dilation(standing, np.ones((2 * half + 1, 1), bool))
+        reach = max(1, round(recording.rate / cutoff))
+        return ~scipy.ndimage.binary_dilation(standing, np.ones((2 * reach + 1, 1), bool))
 
     def settled(self, recordings: Iterable[Recording]) -> "Tracking":
         """With one cutoff for all: the lowest up to which any of their motions is known."""

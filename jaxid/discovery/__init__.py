@@ -5,6 +5,9 @@ from .comparison import compare as compare
 from .diagnosis import Diagnosis as Diagnosis
 from .experiment import Experiment as Experiment
 from .experiment import next_experiment as next_experiment
+from .fleet import Fleet as Fleet
+from .fleet import FleetRobot as FleetRobot
+from .fleet import discover_all as discover_all
 from .screening import diagnose as diagnose
 from .search import discover as discover
 from .story import Discovery as Discovery

@@ -24,11 +24,13 @@ _LATE, _NOTHING = 2.0, 0.02
 class Release(eqx.Module):
     """A loop with values estimated that it held, and what is said of them.
 
+    - `gain`: of the squared error that is predicted.
     - `freedom`: values that were estimated and are not among the loop's parameters.
     """
 
     loop: ClosedLoop
     said: str
+    gain: float
     freedom: int = 0
 
 
@@ -42,21 +44,25 @@ def released(predictor: Predictor, price: float) -> Release | None:
     """
     loop = predictor.system.loop
     nominal = _signal(predictor, loop)
-    values = _shapes(predictor, nominal, price)
-    if values:
+    found = _shapes(predictor, nominal, price)
+    if found:
+        values = {name: value for name, (value, _) in found.items()}
         free = loop.with_values(**values).free(*values)
-        return Release(free, f"{' and '.join(values)} estimated")
-    late = _lateness(predictor, nominal, price)
+        gain = max(gain for _, gain in found.values())
+        return Release(free, f"{' and '.join(values)} estimated", gain)
+    late, gain = _lateness(predictor, nominal, price)
     if late == 0:
         return None
     delay = loop.controller.delay + late  # type: ignore[reportAttributeAccessIssue]
     law = dataclasses.replace(loop.controller, delay=delay)
     moved = dataclasses.replace(loop, controller=law)
-    return Release(moved, f"a delay of the torque of {1e3 * delay:.3g} ms", freedom=1)
+    return Release(moved, f"a delay of the torque of {1e3 * delay:.3g} ms", gain, freedom=1)
 
 
-def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str, float]:
-    """Held shapes that explain more elsewhere than they cost, and where each explains most.
+def _shapes(
+    predictor: Predictor, nominal: np.ndarray, price: float
+) -> dict[str, tuple[float, float]]:
+    """Held shapes that explain more elsewhere than they cost: where each explains most, and what.
 
     Each is moved on its own and simulated; what that changes is held against the residual as an
     effect's signature is. The program is that of the fitted model, so nothing is compiled.
@@ -72,21 +78,24 @@ def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str
                 gains[value] = gain if along > 0 else 0.0
         best = max(gains, key=lambda value: gains[value], default=None)
         if best is not None and gains[best] > price:
-            found[p.name] = best
+            found[p.name] = best, gains[best]
     return found
 
 
-def _lateness(predictor: Predictor, nominal: np.ndarray, price: float) -> float:
-    """How much later than recorded the torque acts, s, where no law is simulated; else nil."""
+def _lateness(predictor: Predictor, nominal: np.ndarray, price: float) -> tuple[float, float]:
+    """How much later than recorded the torque acts, s, where no law is simulated; else nil.
+
+    And what that explains.
+    """
     system = predictor.system
     if not imposed(system.loop) or nominal.shape[1] < 3:
-        return 0.0
+        return 0.0, 0.0
     time = np.asarray(system.batch.time)
     step = float(np.median(np.diff(time[0])))
     late, gain = _held_against(predictor, np.gradient(nominal, step, axis=1))
     delay = late + getattr(system.loop.controller, "delay", 0.0)
     small = abs(late) < _NOTHING * step
-    return 0.0 if gain < price or small or abs(delay) > _LATE * step else late
+    return (0.0 if gain < price or small or abs(delay) > _LATE * step else late), gain
 
 
 def _signal(predictor: Predictor, loop: ClosedLoop) -> Float[np.ndarray, "recordings samples n"]:

@@ -29,9 +29,10 @@ def _estimated(fit: Fit, given: ClosedLoop) -> list[str]:
     for p in fit.loop.free_parameters:
         if p.place in held:
             before, row = float(held[p.place].where(given)), fit.table().loc[p.name]
+            unit = "" if row["unit"] == "1" else f" {row['unit']}"
             found.append(
-                f"{p.name} was estimated, {row['value']:.3g} ± {row['std']:.2g} {row['unit']}: the "
-                f"model's {before:.3g}, a default, does not suit these recordings"
+                f"{p.name} was estimated, {row['value']:.3g} ± {row['std']:.2g}{unit}: the "
+                f"{before:.3g} that the model held by default does not suit these recordings"
             )
     before, after = (getattr(x.controller, "delay", 0.0) for x in (given, fit.loop))
     if after != before and fit.loop.controller.imposes:

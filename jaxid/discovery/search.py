@@ -43,6 +43,8 @@ _VERIFIED, _INEXACT = 3, 0.08
 # Effects that a fitted model is short of at most: sets of two are predicted to a few per cent of
 # what they explain, larger ones are looked for from the next fit.
 _AHEAD = 2
+# How many times more than a released value an effect promises, for it to be tried first.
+_FAR = 2.0
 # Weight from which a rival's error on held-out recordings is worth a simulation.
 _SHOWN = 0.01
 
@@ -186,7 +188,9 @@ class Search:
         fit, predictor = self.seen
         value = np.log(predictor.data.mask.sum() * fit.loop.joints)
         release = released(predictor, value + DECISIVE)
-        if release is None:
+        single = [c.score for c in candidates if c.size == 1]
+        effect = 0.0 if imposed(fit.loop) else max(nothing - min(single, default=np.inf), 0.0)
+        if release is None or release.gain < effect / _FAR:
             return None
         self.say(f"fit with {release.said}")
         loop, noise = release.loop, candidates[0].noise
@@ -197,9 +201,7 @@ class Search:
         model = self._judged(self._added(found), found)
         cost = release.freedom * value
         model = dataclasses.replace(model, score=model.score + cost)
-        single = [] if imposed(loop) else [c.score for c in candidates if c.size == 1]
-        rival = at.score + min(min(single, default=np.inf) - nothing, 0.0)
-        if model.score > min(rival + DECISIVE, at.score):
+        if model.score > min(at.score - effect + DECISIVE, at.score):
             return None
         self.visited.add(model)
         return model

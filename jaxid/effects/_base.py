@@ -103,6 +103,14 @@ class AbstractEffect(eqx.Module):
             return [cls()]
         return [cls(joint=j) for j in scene.joints]  # type: ignore[call-arg]
 
+    @classmethod
+    def fields_of_format(cls, fields: dict[str, Any], written: int) -> dict[str, Any]:
+        """Fields of a saved effect of an older format: a smoothing was given by one over it."""
+        if written > 2 or "gamma" not in fields:
+            return fields
+        kept = {name: value for name, value in fields.items() if name != "gamma"}
+        return {**kept, "smoothing": 1 / fields["gamma"]}
+
     def scaled(self, factor: float) -> "AbstractEffect":
         """The effect at another size, where a finite setting was screened.
 

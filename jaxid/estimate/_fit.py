@@ -1,14 +1,16 @@
 """The one door to every method."""
 
 import dataclasses
+import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
+from ..arms import SerialArm, physical_bodies
 from ..effects import AbstractEffect, AbstractTransmission, check_declared
-from ..errors import FitError
+from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
 from ..simulation.batch import check_joints, check_law
 from ..simulation.loop import ClosedLoop
@@ -50,7 +52,7 @@ def fit(
     if method.rigid:
         _check_rigid(loop, method)
     found = _followed(_doubted(_honest(method.fit(loop, recordings))))
-    notes = (*found.notes, *_band(loop, recordings), *_gaps(recordings))
+    notes = (*found.notes, *_matter(found), *_band(loop, recordings), *_gaps(recordings))
     return dataclasses.replace(found, notes=notes)
 
 
@@ -63,6 +65,41 @@ def _check_rigid(loop: ClosedLoop, method: AbstractMethod) -> None:
                 f"{type(method).__name__} takes what the sensors report for the motion of drive "
                 f"and link, which {effect.effect_name()} sets apart: use OEM, or leave it out"
             )
+
+
+# Chance of estimates of bodies that matter can have lying so far from all of them.
+_CHANCE = 0.01
+
+
+def _matter(found: Fit) -> list[str]:
+    """What to say of base parameters of a serial arm that no bodies have.
+
+    It asks for the extra `sdp`; without it the mass matrix alone says what is not physical.
+    """
+    arm = found.loop.arm
+    names = [p.names for p in found.loop.free_parameters if p.place == ("arm", "base")]
+    if not isinstance(arm, SerialArm) or not names or not found.succeeded:
+        return []
+    at = [found.names.index(name) for name in names[0]]
+    covariance = found.covariance[np.ix_(at, at)]
+    if len(at) < len(arm.base) or not np.isfinite(covariance).all():
+        return []
+    try:
+        nearest = physical_bodies(arm, covariance)
+    except (MissingExtraError, ModelError):
+        return []
+    import scipy
+
+    limit = math.sqrt(scipy.stats.chi2.isf(_CHANCE, len(at)))
+    if nearest.distance < limit:
+        return []
+    moved = np.abs(nearest.base - np.asarray(arm.base)) / np.sqrt(np.diag(covariance))
+    worst = names[0][int(np.argmax(moved))]
+    return [
+        f"no bodies of positive mass have these base parameters: the nearest that do are "
+        f"{nearest.distance:.3g} standard deviations away, most of all in {worst}, so an effect "
+        'that the model lacks may be hidden in them; bodies="drawn" lets it show'
+    ]
 
 
 def _band(loop: ClosedLoop, recordings: Recordings) -> list[str]:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 # Share of its highest speed below which a joint rests.
 _REST = 0.01
+# Share of it that a joint reaches in both directions where it turns.
+_TURN = 0.1
 # Correlation from which two references are one.
 _SAME = 0.9999
 
@@ -105,7 +107,7 @@ def _by_joint(r: Recording, cutoff: float) -> list[dict[str, Any]]:
     resting = np.abs(speed) < _REST * top
     rows = []
     for j in range(r.joints):
-        moving = np.sign(speed[~resting[:, j], j])
+        moving = np.sign(speed[np.abs(speed[:, j]) > _TURN * top[j], j])
         moves = np.abs(np.diff(r.q[:, j]))
         rows.append(
             {

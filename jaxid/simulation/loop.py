@@ -3,7 +3,9 @@
 import dataclasses
 import html
 import math
+import re
 from collections.abc import Iterable
+from typing import Any
 
 import equinox as eqx
 
@@ -216,6 +218,22 @@ class ClosedLoop(eqx.Module):
                 f"there is no effect {name!r}{where} to take away: the loop has {', '.join(there)}"
             )
         return self.with_effects(kept)
+
+    @classmethod
+    def fields_of_format(cls, fields: dict[str, Any], written: int) -> dict[str, Any]:
+        """Fields of a saved loop of an older format: what is held or freed by its name of now."""
+
+        def named(one: str | Place) -> str | Place:
+            if isinstance(one, str):
+                return re.sub(r"^gamma(?=\d)", "eps", one)
+            return tuple("smoothing" if step == "gamma" else step for step in one)
+
+        if written > 2:
+            return fields
+        return {
+            name: frozenset(map(named, value)) if name in ("held", "freed") else value
+            for name, value in fields.items()
+        }
 
     def of_format(self, written: int) -> "ClosedLoop":
         """The loop of a saved result of an older format: the first held and freed names."""

@@ -27,10 +27,12 @@ from .classes import Registry, agrees, hints, origin, rebuilt
 if TYPE_CHECKING:
     import pandas as pd
 
-# Raised whenever an older jaxid could not read what this one writes; older formats stay readable: a
+# Raised whenever an older jaxid could not read what this one writes. Older formats stay readable: a
 # class whose fields meant something else has a method `of_format(format)` that gives the object of
-# now. 2: what a loop holds or frees is kept by place, no longer by name.
-FORMAT = 2
+# now, and one whose fields had other names `fields_of_format(fields, format)`. 2: what a loop holds
+# or frees is kept by place, no longer by name. 3: the smoothing of a sign is a speed, not one over
+# it.
+FORMAT = 3
 
 # Everything but arrays; a story of many steps has about one megabyte.
 _LARGEST_MANIFEST = 256 * 2**20
@@ -288,6 +290,8 @@ class _Unpacker:
     def _object(self, entry: dict[str, Any]) -> Any:
         cls = self._class(entry["package"], entry["class"])
         given = {name: self.value(node) for name, node in entry["fields"].items()}
+        if self.format < FORMAT and hasattr(cls, "fields_of_format"):
+            given = cls.fields_of_format(given, self.format)
         fields = {field.name for field in dataclasses.fields(cls)}
         for name in given:
             if name not in fields:

@@ -10,7 +10,14 @@ import reprlib
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    as_completed,
+    wait,
+)
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import TracebackType
@@ -120,7 +127,12 @@ class Campaign:
         return value if found else self._keep(name, work())
 
     def run(
-        self, work: Callable[[Any], Any], pieces: Mapping[str, Any], *, jobs: int = 1
+        self,
+        work: Callable[[Any], Any],
+        pieces: Mapping[str, Any],
+        *,
+        jobs: int = 1,
+        executor: Executor | None = None,
     ) -> Iterator[tuple[str, Any]]:
         """Name and result of every piece: those that are there first, then the others as they end.
 
@@ -132,6 +144,7 @@ class Campaign:
         - `work`: from an argument to a result; with several jobs, a function of a module.
         - `pieces`: arguments by name.
         - `jobs`: processes that work at the same time.
+        - `executor`: where to work instead; what its workers cannot do gives a `Failed`.
         """
         left = {}
         for name, argument in pieces.items():
@@ -140,7 +153,9 @@ class Campaign:
                 yield name, value
             else:
                 left[name] = argument
-        if jobs == 1:
+        if executor is not None:
+            yield from self._in_executor(work, left, executor)
+        elif jobs == 1:
             for name, argument in left.items():
                 yield name, self._keep(name, _tried(work, argument))
         elif left:
@@ -180,6 +195,20 @@ class Campaign:
         return value
 
     # --- several processes ----------------------------------------------------------------------
+
+    def _in_executor(
+        self, work: Callable[[Any], Any], left: Mapping[str, Any], executor: Executor
+    ) -> Iterator[tuple[str, Any]]:
+        """Only this process writes; a worker that is lost takes its own piece with it alone."""
+        running = {executor.submit(_tried, work, given): name for name, given in left.items()}
+        try:
+            for future in as_completed(running):
+                error = future.exception()
+                value = future.result() if error is None else _Died(f"its worker failed: {error!r}")
+                yield running[future], self._keep(running[future], value)
+        finally:
+            for future in running:
+                future.cancel()
 
     def _in_processes(
         self, work: Callable[[Any], Any], left: Mapping[str, Any], jobs: int

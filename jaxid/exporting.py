@@ -1,0 +1,173 @@
+"""A fitted arm as other programs read it: URDF for kinematics and bodies, MJCF for drives too."""
+
+import os
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from jaxtyping import Float
+
+from .arms import SerialArm
+from .arms.urdf import parsed_urdf, read_urdf
+from .effects import Coulomb, RotorInertia, Viscous
+from .errors import ModelError
+from .simulation.loop import ClosedLoop
+
+
+def write_urdf(
+    loop: ClosedLoop,
+    source: str | os.PathLike[str],
+    path: str | os.PathLike[str],
+    *,
+    bodies: Float[np.ndarray, "joints 10"] | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+) -> Path:
+    """Writes a URDF back with identified bodies and friction, all else as it was.
+
+    Each joint's link gets the body of all that moves with it; what is fixed to it is left without
+    one. `<dynamics>` gets viscous and Coulomb friction. A URDF has no rotors: `write_mjcf` does.
+
+    **Arguments:**
+
+    - `loop`: of a `SerialArm`, fitted.
+    - `source`: the URDF that the arm was read from, path or text. `path`: where to write.
+    - `bodies`: as `physical_bodies` gives them, `(joints, 10)`; the loop's own where None.
+    - `base`, `tip`: as they were given to `SerialArm.from_urdf`.
+
+    **Raises:** `ModelError` for a loop that is not of this URDF.
+    """
+    arm = _serial(loop)
+    found = read_urdf(source, base, tip)
+    if len(found.joints) != arm.joints:
+        raise ModelError(
+            f"this URDF has {len(found.joints)} joints and {loop.name} has {arm.joints}: give the "
+            "one that the arm was read from"
+        )
+    masses = np.asarray(arm.inertias() if bodies is None else bodies)
+    root = parsed_urdf(source)
+    links = {link.get("name"): link for link in root.findall("link")}
+    for name in found.carried:
+        for inertial in links[name].findall("inertial"):
+            links[name].remove(inertial)
+    joints = {joint.get("name"): joint for joint in root.findall("joint")}
+    for k, joint in enumerate(found.joints):
+        links[joint.link].append(_inertial(masses[k]))
+        element = joints[joint.name]
+        for old in element.findall("dynamics"):
+            element.remove(old)
+        viscous, coulomb, _ = _drive(loop, k + 1)
+        ElementTree.SubElement(element, "dynamics", damping=_text(viscous), friction=_text(coulomb))
+    ElementTree.indent(root)
+    text = ElementTree.tostring(root, encoding="unicode")
+    Path(path).write_text(f'<?xml version="1.0"?>\n{text}\n', encoding="utf-8")
+    return Path(path)
+
+
+def write_mjcf(
+    loop: ClosedLoop,
+    path: str | os.PathLike[str],
+    *,
+    bodies: Float[np.ndarray, "joints 10"] | None = None,
+) -> Path:
+    """Writes a MuJoCo model of the arm: bodies, rotors (armature), viscous and dry friction.
+
+    **Arguments:**
+
+    - `loop`: of a `SerialArm`, fitted. `path`: where to write.
+    - `bodies`: as `physical_bodies` gives them, `(joints, 10)`; the loop's own where None.
+
+    **Raises:** `ModelError` for another arm, or bodies that MuJoCo would refuse.
+    """
+    from scipy.spatial.transform import Rotation
+
+    arm = _serial(loop)
+    masses = np.asarray(arm.inertias() if bodies is None else bodies)
+    chain = arm.chain
+    root = ElementTree.Element("mujoco", model=loop.name)
+    ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true")
+    ElementTree.SubElement(root, "option", gravity=_text(*np.asarray(chain.gravity)))
+    parent = ElementTree.SubElement(root, "worldbody")
+    for k in range(arm.joints):
+        x, y, z, w = Rotation.from_matrix(np.asarray(chain.rotations[k])).as_quat()
+        place = _text(*np.asarray(chain.offsets[k]))
+        parent = ElementTree.SubElement(
+            parent, "body", name=f"link{k + 1}", pos=place, quat=_text(w, x, y, z)
+        )
+        mass, centre, about = _about_centre(masses[k])
+        xx, xy, xz, yy, yz, zz = about[np.triu_indices(3)]
+        if mass <= 0 or np.linalg.eigvalsh(about)[0] <= 0:
+            raise ModelError(
+                f"link {k + 1} has mass {mass:.3g} kg and an inertia that no body has: give "
+                "bodies=jaxid.arms.physical_bodies(arm).bodies"
+            )
+        ElementTree.SubElement(
+            parent,
+            "inertial",
+            pos=_text(*centre),
+            mass=_text(mass),
+            fullinertia=_text(xx, yy, zz, xy, xz, yz),
+        )
+        viscous, coulomb, rotor = _drive(loop, k + 1)
+        ElementTree.SubElement(
+            parent,
+            "joint",
+            name=f"joint{k + 1}",
+            type="slide" if chain.slides[k] else "hinge",
+            axis=_text(*np.asarray(chain.axes[k])),
+            range=_text(arm.lower[k], arm.upper[k]),
+            damping=_text(viscous),
+            frictionloss=_text(coulomb),
+            armature=_text(rotor),
+        )
+    ElementTree.indent(root)
+    Path(path).write_text(ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+    return Path(path)
+
+
+def _serial(loop: ClosedLoop) -> SerialArm:
+    if not isinstance(loop.arm, SerialArm):
+        raise ModelError(
+            f"{loop.name} is a {type(loop.arm).__name__}, which has no links in space: only arms "
+            "of SerialArm.from_urdf can be written"
+        )
+    return loop.arm
+
+
+def _drive(loop: ClosedLoop, joint: int) -> tuple[float, float, float]:
+    """Viscous and Coulomb friction and rotor inertia on a joint, of all effects together."""
+    own = [e for e in loop.effects if getattr(e, "joint", None) == joint]
+    viscous = sum(float(e.coefficient) for e in own if isinstance(e, Viscous))
+    coulomb = sum(float(e.level) for e in own if isinstance(e, Coulomb))
+    rotor = sum(float(e.inertia) for e in own if isinstance(e, RotorInertia))
+    return viscous, coulomb, rotor
+
+
+def _about_centre(
+    body: Float[np.ndarray, "10"],
+) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Mass, centre and inertia about it of a body."""
+    mass, moment = float(body[9]), body[6:9]
+    about = np.zeros((3, 3))
+    about[np.triu_indices(3)] = body[:6]
+    about = about + np.triu(about, 1).T
+    centre = moment / mass if mass else np.zeros(3)
+    return mass, centre, about - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+
+
+def _inertial(body: Float[np.ndarray, "10"]) -> Any:
+    mass, centre, about = _about_centre(body)
+    element = ElementTree.Element("inertial")
+    ElementTree.SubElement(element, "origin", xyz=_text(*centre), rpy="0 0 0")
+    ElementTree.SubElement(element, "mass", value=_text(mass))
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    values = about[np.triu_indices(3)]
+    tensor = {name: _text(x) for name, x in zip(names, values, strict=True)}
+    ElementTree.SubElement(element, "inertia", tensor)
+    return element
+
+
+def _text(*values: float) -> str:
+    """Numbers as XML has them, with all their digits."""
+    return " ".join(repr(float(x)) for x in values)

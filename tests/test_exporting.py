@@ -1,0 +1,118 @@
+"""Arms written for other programs, read there, and bodies that matter can have."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxid
+from jaxid.arms import SerialArm, physical_bodies
+from jaxid.arms.physical import smallest_eigenvalues
+from jaxid.errors import ModelError
+from tests.test_serial import described as described
+from tests.test_serial import pinocchio_of
+
+INVERSE = eqx.filter_jit(lambda arm, q, v, a: arm.inverse(q, v, a))
+
+
+def states(arm, count=20, seed=3):
+    """Positions within limits, velocities and accelerations."""
+    rng = np.random.default_rng(seed)
+    low, high = np.maximum(arm.lower, -3.0), np.minimum(arm.upper, 3.0)
+    return [(rng.uniform(low, high), *rng.normal(size=(2, arm.joints))) for _ in range(count)]
+
+
+def other(loop):
+    """The loop with other bodies, all of which matter can have, and drives with friction."""
+    arm = loop.arm
+    bodies = np.asarray(arm.bodies) * np.linspace(0.7, 1.4, arm.joints)[:, None]
+    arm = dataclasses.replace(arm, base=jnp.asarray(arm.combined @ bodies.ravel()))
+    values = {}
+    for j in range(1, arm.joints + 1):
+        values |= {f"Fv{j}": 0.3 * j, f"Fc{j}": 0.2 * j, f"Ia{j}": 0.05 * j}
+    return dataclasses.replace(loop, arm=arm).with_values(**values), bodies
+
+
+def torque(arm, q, v, a):
+    return np.asarray(INVERSE(arm, *map(jnp.asarray, (q, v, a))))
+
+
+def test_a_urdf_is_written_back_with_other_bodies(described, tmp_path):
+    path, tip = described
+    loop, bodies = other(jaxid.serial(path, tip=tip))
+    out = jaxid.write_urdf(loop, path, tmp_path / "out.urdf", bodies=bodies, tip=tip)
+    again = jaxid.serial(out, tip=tip)
+    np.testing.assert_allclose(again.arm.bodies, bodies, rtol=1e-9, atol=1e-12)
+    assert out.read_text().count("<dynamics") >= loop.joints
+    pinocchio = pytest.importorskip("pinocchio")
+    model, position = pinocchio_of(out, again.arm)
+    data = model.createData()
+    for q, v, a in states(loop.arm):
+        ours = torque(loop.arm, q, v, a)
+        size = np.abs(ours).max()
+        np.testing.assert_allclose(torque(again.arm, q, v, a), ours, rtol=1e-9, atol=1e-9 * size)
+        theirs = pinocchio.rnea(model, data, position(q), v, a)
+        np.testing.assert_allclose(theirs, ours, rtol=1e-9, atol=1e-9 * size)
+
+
+def test_mujoco_finds_the_same_torque_in_what_is_written(described, tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    path, tip = described
+    loop, bodies = other(jaxid.serial(path, tip=tip))
+    bodies = physical_bodies(dataclasses.replace(loop.arm, bodies=bodies)).bodies
+    out = jaxid.write_mjcf(loop, tmp_path / "out.xml", bodies=bodies)
+    model = mujoco.MjModel.from_xml_path(str(out))
+    data = mujoco.MjData(model)
+    np.testing.assert_allclose(model.dof_frictionloss, [0.2 * j for j in range(1, loop.joints + 1)])
+    model.dof_frictionloss[:] = 0
+    model.jnt_limited[:] = 0
+    for q, v, a in states(loop.arm):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, v, a
+        mujoco.mj_inverse(model, data)
+        drives = [0.3 * j * v[j - 1] + 0.05 * j * a[j - 1] for j in range(1, loop.joints + 1)]
+        ours = torque(loop.arm, q, v, a) + drives
+        size = np.abs(ours).max()
+        np.testing.assert_allclose(data.qfrc_inverse, ours, rtol=1e-6, atol=1e-6 * size)
+
+
+def test_bodies_of_a_drawing_are_possible(described):
+    path, tip = described
+    arm = SerialArm.from_urdf(path, tip=tip)
+    found = physical_bodies(arm)
+    assert found.possible
+    np.testing.assert_allclose(found.base, arm.base, rtol=1e-6, atol=1e-6 * np.abs(arm.base).max())
+    # Drawn points are moved by a millionth of a body's size.
+    assert smallest_eigenvalues(found.bodies).min() > 0
+
+
+def test_base_parameters_that_no_body_has_are_told_and_moved_to_the_nearest(described):
+    path, tip = described
+    arm = SerialArm.from_urdf(path, tip=tip)
+    largest = int(np.argmax(np.abs(arm.base)))
+    inertia = next(k for k, name in enumerate(arm.base_names) if name[:2] in ("ZZ", "YY", "XX"))
+    base = np.asarray(arm.base).copy()
+    base[inertia] = -abs(base[largest])
+    wrong = dataclasses.replace(arm, base=jnp.asarray(base))
+    sure = np.diag((0.01 * np.maximum(np.abs(base), 0.01 * np.abs(base).max())) ** 2)
+    found = physical_bodies(wrong, sure)
+    assert not found.possible
+    assert found.distance > 10
+    assert smallest_eigenvalues(found.bodies).min() > 0
+    nearest = dataclasses.replace(arm, base=jnp.asarray(found.base))
+    assert physical_bodies(nearest, sure).distance < 1
+
+
+def test_only_arms_in_space_are_written_and_only_to_their_own_urdf(described, tmp_path):
+    path, tip = described
+    with pytest.raises(ModelError, match="only arms of SerialArm"):
+        jaxid.write_urdf(jaxid.scara(), path, tmp_path / "out.urdf", tip=tip)
+    one = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
+      <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      <joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></robot>"""
+    with pytest.raises(ModelError, match="has 1 joints and"):
+        jaxid.write_urdf(jaxid.serial(path, tip=tip), one, tmp_path / "out.urdf")
+    negative = np.asarray(jaxid.serial(one).arm.bodies) * [*[1] * 9, -1]
+    with pytest.raises(ModelError, match="physical_bodies"):
+        jaxid.write_mjcf(jaxid.serial(one), tmp_path / "out.xml", bodies=negative)

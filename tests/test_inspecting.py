@@ -1,0 +1,168 @@
+"""`jaxid inspect` and `jaxid diagnose`, and logs as they are: gaps, blanks, jitter, other names."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import jaxid
+from jaxid.cli import app
+from jaxid.cli.inspecting import guess
+from jaxid.errors import JaxidWarning, RecordingError
+
+DEMO = Path(jaxid.__file__).parent / "demo" / "hidden"
+FIT_1, FIT_2 = (str(DEMO / f"{name}.csv") for name in ("fit_1", "fit_2"))
+
+
+def run(*arguments):
+    """The command's result; an exception that it does not turn into a sentence is raised."""
+    return CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+
+
+def log(path, change=None):
+    """The first bundled recording with a laboratory's names, in degrees, ms and amperes."""
+    table = pd.read_csv(FIT_1)
+    made = pd.DataFrame({"stamp": 1e3 * table.time})
+    for j in (1, 2):
+        made[f"pos{j}"] = np.degrees(table[f"q_{j}"])
+        made[f"cur{j}"] = table[f"tau_{j}"] / 6.2
+        made[f"des{j}"] = np.degrees(table[f"q_ref_{j}"])
+    made = made if change is None else change(made)
+    made.to_csv(path, index=False)
+    return path
+
+
+def test_what_is_in_a_recording_is_what_was_put_there(tmp_path):
+    time = np.arange(0.0, 10.0, 0.01)
+    q = np.column_stack([np.sin(time), 0.2 * np.clip(time - 2, 0, 3)])
+    tau = np.column_stack([3 * np.cos(time), np.sign(time - 5)])
+    one = jaxid.Recording.from_arrays(time, q, tau, name="one")
+    other = jaxid.Recording.from_arrays(time, q + 1e-5 * tau, 2 * tau, name="other")
+    found = jaxid.inspect([one, other])
+    row = found.joints.loc[("one", 1)]
+    assert row["from"] == pytest.approx(-1, abs=1e-3)
+    assert row["speed"] == pytest.approx(1, rel=0.02)
+    assert row["turns"] == 3
+    assert row["tau peak"] == pytest.approx(3)
+    # Of ten seconds the second joint moves for three, and a little more through the low-pass.
+    assert found.joints.loc[("one", 2), "rest %"] == pytest.approx(70, abs=10)
+    assert found.signals.loc["one", "Hz"] == pytest.approx(100)
+    assert found.repeats == (("one", "other"),)
+    assert any("joint 2 hardly reverses" in note for note in found.notes)
+    assert "one and other repeat" in repr(found)
+    assert "one and other repeat" in found._repr_html_()
+    assert json.loads(json.dumps(found.to_dict()))["repeats"] == [["one", "other"]]
+
+
+@pytest.mark.parametrize(
+    ("names", "q", "tau"),
+    [
+        ("t,q1,q2,qd1,qd2,tau1,tau2", ["q1", "q2"], ["tau1", "tau2"]),
+        ("stamp,pos_2,pos_1,effort_1,effort_2", ["pos_1", "pos_2"], ["effort_1", "effort_2"]),
+        ("Time,Position[1],Position[2],Current[1],Current[2]", None, None),
+        ("timestamp,angle,torque", ["angle"], ["torque"]),
+        ("time,actual_q_0,actual_q_1,actual_current_0,actual_current_1", None, None),
+    ],
+)
+def test_columns_are_guessed_by_what_logs_call_them(names, q, tau):
+    listed = names.split(",")
+    found = guess(listed)
+    assert found["time"] == listed[0]
+    assert found["q"] == (q or listed[1:3])
+    assert found["tau"] == (tau or listed[3:5])
+
+
+@pytest.mark.parametrize("names", ["a,b,c", "time,q1,q2,tau1", "q1,tau1"])
+def test_nothing_is_guessed_where_a_signal_is_not_there(names):
+    assert guess(names.split(",")) == {}
+
+
+def test_a_log_is_inspected_described_and_read(tmp_path):
+    path, toml = log(tmp_path / "run.csv"), tmp_path / "log.toml"
+    figure, out = tmp_path / "run.html", tmp_path / "run.json"
+    seen = run("inspect", path, "--write", toml, "--unit", "q=deg", "--plot", figure, "--json", out)
+    assert seen.exit_code == 0, seen.stderr
+    assert "time=stamp  q=pos1,pos2  tau=cur1,cur2  q_ref=des1,des2" in seen.stdout
+    assert all(len(x) <= 100 for x in seen.stdout.splitlines() if x.startswith("run "))
+    assert "plotly" in figure.read_text(encoding="utf-8").lower()
+    assert json.loads(out.read_text())["recordings"][0]["samples"] == 1001
+    told = tomllib.loads(toml.read_text(encoding="utf-8"))
+    assert told["columns"]["q"] == ["pos1", "pos2"]
+    # As a user edits it.
+    text = toml.read_text(encoding="utf-8")
+    text = text.replace('time = "s"', 'time = "ms"').replace('["rad", "rad"]', '["deg", "deg"]')
+    text = text.replace('"cur1", "cur2"', '"cur1*6.2", "cur2*6.2"')
+    toml.write_text(text, encoding="utf-8")
+    options = ("--robot", "scara", "--method", "idim")
+    one, other = tmp_path / "one.json", tmp_path / "other.json"
+    assert run("fit", path, *options, "--log", toml, "--json", one).exit_code == 0
+    assert run("fit", FIT_1, *options, "--json", other).exit_code == 0
+    values = [json.loads(f.read_text())["parameters"]["ZZ1r"]["value"] for f in (one, other)]
+    assert values[0] == pytest.approx(values[1], rel=1e-6)
+
+
+def test_a_description_that_says_something_else_is_refused(tmp_path):
+    toml = tmp_path / "log.toml"
+    for text, says in (("colums = {}", "'colums'"), ("gaps = 3", "'gaps'"), ("= 1", "no TOML")):
+        toml.write_text(text)
+        refused = run("fit", FIT_1, "--robot", "scara", "--log", toml)
+        assert refused.exit_code == 2
+        assert says in refused.stderr
+        assert len(refused.stderr.splitlines()) == 1
+
+
+def test_blank_cells_are_refused_by_line_and_left_out_if_told(tmp_path):
+    def blank(table):
+        table.loc[[40, 41, 300], "pos2"] = np.nan
+        return table
+
+    path = log(tmp_path / "run.csv", blank)
+    names = {"time": "stamp", "q": ["pos1", "pos2"], "tau": ["cur1", "cur2"]}
+    units = {"time": "ms", "q": "deg"}
+    with pytest.raises(RecordingError, match=r"pos2, line 42 is empty .*--drop-nan"):
+        jaxid.read(path, columns=names, units=units)
+    with pytest.warns(JaxidWarning, match=r"3 of 1001 samples are left out.*line 42"):
+        (less,) = jaxid.read(path, columns=names, units=units, nan="drop")
+    assert less.samples == 998
+
+
+def test_times_of_a_logger_are_told_and_evened(tmp_path):
+    rng = np.random.default_rng(1)
+
+    def jitter(table):
+        table["stamp"] += rng.uniform(-3, 3, len(table))
+        return table
+
+    path = log(tmp_path / "run.csv", jitter)
+    names = {"time": "stamp", "q": ["pos1", "pos2"], "tau": ["cur1", "cur2"]}
+    units = {"time": "ms", "q": "deg"}
+    with pytest.warns(JaxidWarning, match=r"jitter by .* ms about .*--clock even"):
+        jaxid.read(path, columns=names, units=units)
+    (even,) = jaxid.read(path, columns=names, units=units, clock="even")
+    np.testing.assert_allclose(even.time, pd.read_csv(FIT_1).time, atol=4e-4)
+    # Samples that are uneven in truth are no reason to warn.
+    time = np.cumsum(rng.uniform(0.006, 0.014, 800))
+    jaxid.Recording.from_arrays(time, np.sin(time), np.cos(3 * time))
+
+
+def test_lines_are_counted_as_an_editor_does(tmp_path):
+    path = tmp_path / "run.csv"
+    lines = Path(FIT_1).read_text().splitlines()
+    lines[5] = lines[5].replace(lines[5].split(",")[1], "high")
+    path.write_text("# a comment\n\n" + "\n".join(lines) + "\n")
+    with pytest.raises(RecordingError, match="line 8 holds 'high'"):
+        jaxid.read(path)
+
+
+@pytest.mark.slow
+def test_diagnose_ranks_what_the_bundled_arm_lacks(tmp_path):
+    out = tmp_path / "ranking.json"
+    found = run("diagnose", FIT_1, FIT_2, "--robot", "scara", "--json", out)
+    assert found.exit_code == 0, found.stderr
+    ranking = json.loads(out.read_text())["ranking"]
+    assert ranking[0]["p_value"] < 0.01
+    assert ranking[0]["effect"] in found.stdout
