@@ -154,7 +154,8 @@ def _hidden(rng, wanted, robot, frictions, speed, duration, clean, level) -> tup
         places = [j for j, link in enumerate(robot.links) if not (link.slides and name in TURNING)]
         j = int(rng.choice(places))
         shape = draw_shape(rng, name, duration)
-        effect = Hidden(name, j, frictions[j], robot.links[j].travel, float(speed[j]), shape)
+        link = robot.links[j]
+        effect = Hidden(name, j, frictions[j], link.travel, float(speed[j]), shape, link.slides)
         plain = np.sqrt(np.mean(_along(effect, clean) ** 2))
         effect.size = float(level[j] * math.exp(rng.uniform(math.log(3), math.log(12))) / plain)
         if name in ("asymmetric_friction", "friction_step", "thermal_drift", "load_dependent"):

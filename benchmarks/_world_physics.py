@@ -158,6 +158,7 @@ class Hidden:
     travel: float
     speed: float
     drawn: dict[str, float]
+    slides: bool = False
     size: float = 0.0
     # Of effects with a memory.
     state: float = 0.0
@@ -181,7 +182,9 @@ class Hidden:
                 f = self.friction
                 return abs(tau[j] - f.coulomb * sign - f.viscous * w) * sign
             case "position_dependent_friction":
-                return sign * math.cos(d["turns"] * math.pi * x + d["phase"])
+                # Once or twice a turn, or along the travel of a joint that slides.
+                angle = 0.5 * math.pi * x if self.slides else q[j]
+                return sign * math.cos(d["turns"] * angle + d["phase"])
             case "hysteresis":
                 reach = d["reach"] * self.travel
                 self.state += dt * w * (1.0 - self.state * (1 if w > 0 else -1)) / reach
@@ -216,7 +219,7 @@ def draw_shape(rng: np.random.Generator, name: str, duration: float) -> dict[str
     draws: dict[str, dict[str, float]] = {
         "stribeck": {"velocity": uniform(0.03, 0.12), "exponent": float(rng.choice([1.0, 2.0]))},
         "position_dependent_friction": {
-            "turns": uniform(0.5, 1.5),
+            "turns": float(rng.integers(1, 3)),
             "phase": uniform(0, 2 * math.pi),
         },
         "hysteresis": {"reach": uniform(0.03, 0.1)},

@@ -4,13 +4,14 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
 
 
-def _quick(name: str, folder: Path) -> list[dict]:
+def _quick(name: str, folder: Path) -> Any:
     if not (ROOT / "benchmarks").is_dir():
         pytest.skip("no benchmarks beside the tests: they are part of a checkout alone")
     file = folder / f"{name}.json"
@@ -88,3 +89,22 @@ def test_settings_of_the_process_are_each_taken_away(tmp_path):
     assert {task for task, _ in rows} == {"simulation", "Jacobian", "whole fit"}
     assert len(rows) == 12
     assert rows["Jacobian", "as jaxid sets them"]["run"] == 1
+
+
+@pytest.mark.slow
+def test_worlds_are_simulated_by_mujoco_and_judged(tmp_path):
+    pytest.importorskip("mujoco")
+    found = _quick("worlds", tmp_path)
+    assert len(found["cases"]) == 2
+    for case in found["cases"]:
+        assert "error" not in case, case["error"]
+        assert case["marks"]["verdict"] in (
+            "adequate",
+            "explained",
+            "outside_catalogue",
+            "undetermined",
+        )
+        assert case["marks"]["ratio"] > 0.5
+        # What was hidden is larger than the noise that hides it.
+        assert all(size > noise for size, noise in case["strength"])
+    assert found["scores"]["unknown"]["errors"] == []

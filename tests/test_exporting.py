@@ -11,8 +11,8 @@ import jaxid
 from jaxid.arms import SerialArm, physical_bodies
 from jaxid.arms.physical import smallest_eigenvalues
 from jaxid.errors import ModelError
+from tests.test_serial import SHARED, pinocchio_of
 from tests.test_serial import described as described
-from tests.test_serial import pinocchio_of
 
 INVERSE = eqx.filter_jit(lambda arm, q, v, a: arm.inverse(q, v, a))
 
@@ -116,3 +116,25 @@ def test_only_arms_in_space_are_written_and_only_to_their_own_urdf(described, tm
     negative = np.asarray(jaxid.serial(one).arm.bodies) * [*[1] * 9, -1]
     with pytest.raises(ModelError, match="physical_bodies"):
         jaxid.write_mjcf(jaxid.serial(one), tmp_path / "out.xml", bodies=negative)
+
+
+@pytest.mark.slow
+def test_free_bodies_that_stand_for_a_spring_are_told():
+    """On a KUKA KR300 free bodies stand for the spring that balances it, and no matter has them.
+
+    With bodies as drawn, the spring that the model lacks shows on a recording that no fit has seen.
+    """
+    folder = SHARED / "kr300"
+    if not folder.exists():
+        pytest.skip("the recordings beside the checkout are not there")
+    a, b = jaxid.read(folder / "kr300_A.csv.gz", folder / "kr300_B.csv.gz", columns={"time": "t"})
+    law = jaxid.control.Tracking(cutoff=5.0)
+    free = jaxid.fit(jaxid.serial(folder / "kr300.urdf", law, bodies="free"), a)
+    assert any("no bodies of positive mass" in note for note in free.notes)
+    drawn = jaxid.serial(folder / "kr300.urdf", law)
+    without = jaxid.fit(drawn, a)
+    assert not any("bodies of positive mass" in note for note in without.notes)
+    sprung = jaxid.fit(drawn.without("torque_offset", 2).add(jaxid.effects.Spring(joint=2)), a)
+    errors = [jaxid.compare(fit, b).error_percent["joint 2"].iloc[0] for fit in (without, sprung)]
+    assert errors[0] > 80
+    assert errors[1] < 10

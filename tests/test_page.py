@@ -168,7 +168,8 @@ def test_hostile_files_and_columns_are_inert(
     columns = ["time={}time", "q={0}q_1,{0}q_2", "tau={0}tau_1,{0}tau_2"]
     columns += ["q_ref={0}q_ref_1,{0}q_ref_2"]
     given = [word for c in columns for word in ("--column", c.format(BOLD))]
-    command = ["discover", *files[:2], "--validate", files[2], *given, "--report", "out.html"]
+    held = ["--validate", files[2], "--robot", "scara"]
+    command = ["discover", *files[:2], *held, *given, "--report", "out.html"]
     result = CliRunner().invoke(app, command, catch_exceptions=False)
     assert result.exit_code == 0
     window = Opened(browser, page=tmp_path / "out.html")

@@ -36,7 +36,7 @@ class Tracking(AbstractController):
       noise, and once fitted the lowest of these.
     - `still`: share of its highest speed below which a joint stands still. Friction holds it then
       with any torque up to that of breaking away, which no motion tells, so neither then nor within
-      a period of the cutoff is its torque compared; nil compares it all.
+      a period of the cutoff, 30 ms at the least, is its torque compared; nil compares it all.
     """
 
     bandwidth: float = 40.0
@@ -74,9 +74,10 @@ class Tracking(AbstractController):
     def moving(
         self, recording: Recording, cutoff: float
     ) -> Bool[np.ndarray, "samples joints"] | None:
-        """At which samples a joint moves, and has moved for as long as the low-pass remembers."""
-        import scipy
+        """At which samples a joint moves, and has moved for as long as the low-pass remembers.
 
+        Of a joint that turns so often that little would be left, nearer samples are taken as well.
+        """
         if self.still <= 0:
             return None
         time = even_times(recording)
@@ -86,8 +87,8 @@ class Tracking(AbstractController):
         turns = speed[1:] * speed[:-1] < 0
         standing[1:] |= turns
         standing[:-1] |= turns
-        reach = max(1, round(recording.rate / cutoff))
-        return ~scipy.ndimage.binary_dilation(standing, np.ones((2 * reach + 1, 1), bool))
+        memory = recording.rate * max(1 / cutoff, _PRESLIDING)
+        return np.stack([_far_from(column, memory) for column in standing.T], axis=1)
 
     def settled(self, recordings: Iterable[Recording]) -> "Tracking":
         """With one cutoff for all: the lowest up to which any of their motions is known."""
@@ -101,3 +102,24 @@ class Tracking(AbstractController):
         at = np.clip(recording.time + self.delay, times[0], times[-1])
         q = resampled(times, smooth, at)
         return Signals(q, np.zeros_like(recording.tau))
+
+
+# How long after a turn dry friction takes to build up, s, however wide the band is.
+_PRESLIDING = 0.03
+# Share of the samples at which a joint moves that are compared at the least.
+_LEAST = 0.6
+
+
+def _far_from(there: Bool[np.ndarray, " samples"], reach: float) -> Bool[np.ndarray, " samples"]:
+    """What is further from something than a reach, or a part of it that leaves enough."""
+    import scipy
+
+    if there.mean() > 0.95:
+        # A joint that is held: its noise is all that there is to compare.
+        return np.ones_like(there)
+    for part in (1.0, 0.5, 0.25):
+        width = 2 * round(part * reach) + 1
+        found = ~scipy.ndimage.binary_dilation(there, np.ones(width, bool))
+        if found.sum() > _LEAST * (~there).sum():
+            return found
+    return ~there

@@ -121,6 +121,10 @@ class Visited:
         if had is None or (model.beyond, model.score) < (had.beyond, had.score):
             self._models[model.key] = model
 
+    def forget(self, gone: set[tuple]) -> None:
+        """Leaves out all models with an effect of these forms."""
+        self._models = {k: m for k, m in self._models.items() if not gone.intersection(k)}
+
     def add_predicted(
         self,
         found: Iterable[Candidate],

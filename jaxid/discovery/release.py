@@ -16,6 +16,9 @@ from .predict import Predictor
 
 # A value above zero is tried so many times larger and smaller.
 _FACTOR = 5.0
+# Fields of a smoothed sign, and where they end a parameter's place.
+_SIGN = "smoothing", "form"
+_SIGNS = {(what,) for what in _SIGN}
 # Samples by which torque may be late as the commands of a sampled law are; more is a mistake in the
 # recordings. Changes of less than this share of a sample are not worth a fit.
 _LATE, _NOTHING = 2.0, 0.02
@@ -44,12 +47,12 @@ def released(predictor: Predictor, price: float) -> Release | None:
     """
     loop = predictor.system.loop
     nominal = _signal(predictor, loop)
-    found = _shapes(predictor, nominal, price)
-    if found:
-        values = {name: value for name, (value, _) in found.items()}
-        free = loop.with_values(**values).free(*values)
-        gain = max(gain for _, gain in found.values())
-        return Release(free, f"{' and '.join(values)} estimated", gain)
+    values = _shapes(predictor, nominal, price)
+    if values:
+        held = [p.name for p in doubtful(loop) if p.name in values]
+        free = loop.with_values(**values).free(*held)
+        change = _signal(predictor, loop.with_values(**values)) - nominal
+        return Release(free, f"{' and '.join(held)} estimated", _gain(predictor, change))
     late, gain = _lateness(predictor, nominal, price)
     if late == 0:
         return None
@@ -59,27 +62,50 @@ def released(predictor: Predictor, price: float) -> Release | None:
     return Release(moved, f"a delay of the torque of {1e3 * delay:.3g} ms", gain, freedom=1)
 
 
-def _shapes(
-    predictor: Predictor, nominal: np.ndarray, price: float
-) -> dict[str, tuple[float, float]]:
-    """Held shapes that explain more elsewhere than they cost: where each explains most, and what.
+def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str, float]:
+    """Held shapes that explain more elsewhere than they cost: by name, values to begin a fit at.
 
-    Each is moved on its own and simulated; what that changes is held against the residual as an
-    effect's signature is. The program is that of the fitted model, so nothing is compiled.
+    The smoothing and the form of one sign go together: a fit has made up with one for the other.
+    Each setting is simulated, and what it changes is held against the residual as the signature of
+    an effect is. The program is that of the fitted model, so nothing is compiled.
     """
     loop = predictor.system.loop
-    found = {}
+    names = {p.place: p.name for p in loop.parameters}
+    found: dict[str, float] = {}
     for p in doubtful(loop):
-        gains = {}
-        for value in _elsewhere(p, loop):
-            change = _signal(predictor, loop.with_values(**{p.name: value})) - nominal
-            if np.isfinite(change).all():
-                along, gain = _held_against(predictor, change)
-                gains[value] = gain if along > 0 else 0.0
-        best = max(gains, key=lambda value: gains[value], default=None)
-        if best is not None and gains[best] > price:
-            found[p.name] = best, gains[best]
+        if p.name in found:
+            continue
+        together = [names[(*p.place[:2], what)] for what in _SIGN if p.place[2:] in _SIGNS]
+        best: dict[str, float] = {}
+        most = price
+        for values in _settings(p, together, loop):
+            change = _signal(predictor, loop.with_values(**values)) - nominal
+            if np.isfinite(change).all() and (gain := _gain(predictor, change)) > most:
+                best, most = values, gain
+        found |= best
     return found
+
+
+def _settings(p: Parameter, together: list[str], loop: ClosedLoop) -> list[dict[str, float]]:
+    """Other values worth trying, of a parameter or of a sign's smoothing and form."""
+    if not together:
+        return [{p.name: value} for value in _elsewhere(p, loop)]
+    smoothing, form = together
+    signs = [q for q in loop.parameters if q.place[2:] in _SIGNS]
+    named = {q.name: float(np.asarray(q.where(loop))) for q in signs}
+    # Along a given motion a simulation costs next to nothing.
+    fine = imposed(loop)
+    factors = (0.2, 0.4, 0.7, 1.0, 1.5, 2.5, 5.0) if fine else (0.2, 1.0, 5.0)
+    forms = (0.0, 0.3, 0.6, 1.0) if fine else (0.0, 1.0)
+    held = {q.name for q in doubtful(loop)}
+    chosen = [
+        {smoothing: named[smoothing] * factor, form: value}
+        for factor in factors
+        for value in (forms if form in held else (named[form],))
+        if smoothing in held or form in held
+    ]
+    now = {smoothing: named[smoothing], form: named[form]}
+    return [values for values in chosen if values != now]
 
 
 def _lateness(predictor: Predictor, nominal: np.ndarray, price: float) -> tuple[float, float]:
@@ -102,6 +128,13 @@ def _signal(predictor: Predictor, loop: ClosedLoop) -> Float[np.ndarray, "record
     """What is compared of a simulation along the recordings, before any filter."""
     system = predictor.system
     return np.asarray(getattr(simulate_batch(loop, system.batch), SIGNALS[system.row]))
+
+
+def _gain(predictor: Predictor, change: np.ndarray) -> float:
+    """What a change explains, as it is or where it is more at its best size."""
+    along, gain = _held_against(predictor, change)
+    size = gain / max(along**2, 1e-300)
+    return max((2 * along - 1) * size, gain if along > 0 else 0.0)
 
 
 def _held_against(predictor: Predictor, change: np.ndarray) -> tuple[float, float]:
@@ -139,7 +172,11 @@ def _elsewhere(p: Parameter, loop: ClosedLoop) -> list[float]:
     """Other values worth trying, within bounds."""
     value = float(np.asarray(p.where(loop)))
     low, high = p.declaration.lower, p.declaration.upper
-    tried = (value / _FACTOR, value * _FACTOR) if value > 0 else (p.declaration.scale,)
+    if value > 0:
+        tried = value / _FACTOR, value * _FACTOR
+    else:
+        # A small step says whether it helps beside what else moves, a large one how far it goes.
+        tried = p.declaration.scale / _FACTOR, p.declaration.scale
     return [x for x in tried if low <= x <= high]
 
 

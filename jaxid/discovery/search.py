@@ -9,6 +9,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Float
 
 from ..control import OpenLoop
 from ..display.progress import working
@@ -43,8 +44,9 @@ _VERIFIED, _INEXACT = 3, 0.08
 # Effects that a fitted model is short of at most: sets of two are predicted to a few per cent of
 # what they explain, larger ones are looked for from the next fit.
 _AHEAD = 2
-# How many times more than a released value an effect promises, for it to be tried first.
-_FAR = 2.0
+# Share of what a model leaves that an effect must explain where the law is unknown: what filters on
+# motion and torque, ticks and stiction leave is of that size in the best of recordings.
+_BLURRED = 0.25
 # Weight from which a rival's error on held-out recordings is worth a simulation.
 _SHOWN = 0.01
 
@@ -190,7 +192,7 @@ class Search:
         release = released(predictor, value + DECISIVE)
         single = [c.score for c in candidates if c.size == 1]
         effect = 0.0 if imposed(fit.loop) else max(nothing - min(single, default=np.inf), 0.0)
-        if release is None or release.gain < effect / _FAR:
+        if release is None or release.gain < effect:
             return None
         self.say(f"fit with {release.said}")
         loop, noise = release.loop, candidates[0].noise
@@ -261,7 +263,7 @@ class Search:
 
     def _without_one(self, at: Model) -> Model | None:
         """The model without one of its effects, where that is better, or nothing worth knowing."""
-        if len(at.effects) < 2:
+        if not at.effects:
             return None
         assert at.fit is not None
         found = []
@@ -273,21 +275,26 @@ class Search:
         best = min(found, key=lambda m: m.score, default=at)
         if best.score < at.score:
             return best
-        small = [m for m in found if self._lost(m, at) < self.asked.worth]
-        return min(small, key=lambda m: m.score, default=None)
+        small = [m for m in found if not self._loses(m, at)]
+        best = min(small, key=lambda m: m.score, default=None)
+        if best is not None:
+            # What it had more is not worth knowing, and not a rival in any company.
+            self.visited.forget(set(at.key) - set(best.key))
+        return best
 
-    def _lost(self, less: Model, at: Model) -> float:
-        """Share of some joint's torque by which a model with less explains less, %."""
+    def _loses(self, less: Model, at: Model) -> bool:
+        """Whether a model with less leaves more of some joint's torque by what is worth knowing."""
         assert less.left is not None
         assert at.left is not None
-        return float(np.sqrt(np.maximum(less.left**2 - at.left**2, 0.0)).max())
+        lost = np.sqrt(np.maximum(less.left**2 - at.left**2, 0.0))
+        return bool(np.any(lost > self._worth(at, at.left)))
 
     def _refitted(self, at: Model, effects: Sequence[AbstractEffect]) -> Model:
         """A part of a fitted model's effects, fitted from where they are."""
         assert at.fit is not None
         loop, noise = at.fit.loop, at.noise
         kept = [e for e in loop.effects if not any(e is x for x in at.effects)]
-        self.say(f"fit with {_listed(effects)} alone")
+        self.say(f"fit with {_listed(effects) or 'nothing'} alone")
         fit = self.campaign.piece(
             _piece(effects),
             lambda: self.refits.filtered(loop.with_effects((*kept, *effects)), noise),
@@ -323,7 +330,20 @@ class Search:
         left = np.linalg.norm(np.concatenate(at.fit.residuals), axis=0)
         changed = np.linalg.norm((c.rest - plain.rest).reshape(-1, c.rest.shape[-1]), axis=0)
         percent = over_recordings(at.fit.error_percent.to_numpy())
-        return bool(np.any(changed * percent > self.asked.worth * left))
+        return bool(np.any(changed * percent > self._worth(at, percent) * left))
+
+    def _worth(
+        self, at: Model, percent: Float[np.ndarray, " joints"]
+    ) -> Float[np.ndarray, " joints"]:
+        """Change of a joint's torque that is worth knowing, %.
+
+        **Arguments:**
+
+        - `percent`: what a model leaves of each joint's torque.
+        """
+        assert at.fit is not None
+        least = _BLURRED if imposed(at.fit.loop) else 0.0
+        return np.maximum(self.asked.worth, least * percent)
 
     def _left_by(self, c: Candidate) -> np.ndarray:
         """Relative error by joint that a set predicted in the last round leaves, %."""
