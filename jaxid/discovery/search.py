@@ -139,7 +139,12 @@ class Search:
                 break
             at = better
         self.at = at
-        return self._verdict(candidates, nothing)
+        outcome = self._verdict(candidates, nothing)
+        if self.at.key not in self.diagnoses:
+            # A model of an earlier round, from which the search did not go on.
+            assert self.at.fit is not None
+            self._screened(self.at.fit, self.at.effects)
+        return outcome
 
     def _start(self, loop: ClosedLoop) -> Model:
         """The starting model, fitted with the noise known."""

@@ -231,8 +231,14 @@ def smooth_sign(
 
     - `v`: rad/s or m/s. `smoothing`: the speed at which it is a half, 1/gamma of Brunot et al.
       2016; at zero it is the sign itself.
-    - `form`: share of a hyperbolic tangent, a half at the same speed, in place of the arctan.
+    - `form`: how soon it comes near the sign beyond that speed: 0 for the arctan, 1/2 for
+      x / sqrt(3 + x²), 1 for a hyperbolic tangent, each a half at the same speed, and between these
+      their parabola, which is above one by two thousandths at the most.
     """
     x = v / (smoothing + _SHARP)
     slow = 2 / jnp.pi * jnp.arctan(x)
-    return slow if form is None else slow + form * (jnp.tanh(_HALF * x) - slow)
+    if form is None:
+        return slow
+    root = x / jnp.sqrt(3 + x**2)
+    shares = (1 - form) * (1 - 2 * form), 4 * form * (1 - form), form * (2 * form - 1)
+    return shares[0] * slow + shares[1] * root + shares[2] * jnp.tanh(_HALF * x)

@@ -38,8 +38,9 @@ class Viscous(AbstractEffect):
 class Coulomb(AbstractEffect):
     """Dry friction, smoothed: Fc sigma(v), sigma = 2/pi arctan(v/eps) (Brunot et al. 2016).
 
-    `form` leads from the arctan at 0 to tanh(v/eps · artanh(1/2)) at 1, which reaches the sign's
-    value sooner; at either, sigma is a half at v = eps.
+    `form` leads from the arctan at 0 over (v/eps) / sqrt(3 + (v/eps)²) at 1/2 to
+    tanh(v/eps · artanh(1/2)) at 1, which reach the sign's value sooner; with each, sigma is a half
+    at v = eps.
     """
 
     joint_fields = ("joint",)
