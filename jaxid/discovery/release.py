@@ -27,7 +27,7 @@ _LATE, _NOTHING = 2.0, 0.02
 class Release(eqx.Module):
     """A loop with values estimated that it held, and what is said of them.
 
-    - `gain`: of the squared error that is predicted.
+    - `gain`: by how much the score is predicted to fall.
     - `freedom`: values that were estimated and are not among the loop's parameters.
     """
 
@@ -52,14 +52,16 @@ def released(predictor: Predictor, price: float) -> Release | None:
         held = [p.name for p in doubtful(loop) if p.name in values]
         free = loop.with_values(**values).free(*held)
         change = _signal(predictor, loop.with_values(**values)) - nominal
-        return Release(free, f"{' and '.join(held)} estimated", _gain(predictor, change))
+        gain = _fall(predictor, _gain(predictor, change))
+        return Release(free, f"{' and '.join(held)} estimated", gain)
     late, gain = _lateness(predictor, nominal, price)
     if late == 0:
         return None
     delay = loop.controller.delay + late  # type: ignore[reportAttributeAccessIssue]
     law = dataclasses.replace(loop.controller, delay=delay)
     moved = dataclasses.replace(loop, controller=law)
-    return Release(moved, f"a delay of the torque of {1e3 * delay:.3g} ms", gain, freedom=1)
+    said = f"a delay of the torque of {1e3 * delay:.3g} ms"
+    return Release(moved, said, _fall(predictor, gain), freedom=1)
 
 
 def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str, float]:
@@ -128,6 +130,13 @@ def _signal(predictor: Predictor, loop: ClosedLoop) -> Float[np.ndarray, "record
     """What is compared of a simulation along the recordings, before any filter."""
     system = predictor.system
     return np.asarray(getattr(simulate_batch(loop, system.batch), SIGNALS[system.row]))
+
+
+def _fall(predictor: Predictor, gain: float) -> float:
+    """By how much the score falls where that much of the squared error is explained."""
+    left = float(np.sum(_white(predictor, predictor.data.residual) ** 2))
+    rows = int(predictor.data.mask.sum()) * predictor.data.residual.shape[2]
+    return rows * float(np.log(left / max(left - gain, 1e-9 * left)))
 
 
 def _gain(predictor: Predictor, change: np.ndarray) -> float:
