@@ -70,8 +70,8 @@ def draw_wanted(master: int, count: int, laws: Sequence[str], robot: str = "any"
     for number in range(count):
         kind = KINDS[int(rng.choice(4, p=(0.6, 0.1, 0.2, 0.1)))]
         chosen = str(rng.choice(ROBOTS)) if robot == "any" else robot
-        slides = {"axis": "all", "gantry": "all", "polar": "last"}.get(chosen)
-        known = [e for e in EFFECTS if slides != "all" or e not in TURNING]
+        turns = chosen not in ("axis", "gantry")
+        known = [e for e in EFFECTS if turns or e not in TURNING]
         strange = [e for e in OUTSIDE if chosen not in ("axis", "pendulum") or e != "cross_bump"]
         size = {"single": 1, "double": 2, "clean": 0, "outside": 1}[kind]
         names = rng.choice(strange if kind == "outside" else known, size, replace=False).tolist()
@@ -158,8 +158,8 @@ def _hidden(rng, wanted, robot, frictions, speed, duration, clean, level) -> tup
         effect = Hidden(name, j, frictions[j], link.travel, float(speed[j]), shape, link.slides)
         plain = np.sqrt(np.mean(_along(effect, clean) ** 2))
         effect.size = float(level[j] * math.exp(rng.uniform(math.log(3), math.log(12))) / plain)
-        if name in ("asymmetric_friction", "friction_step", "thermal_drift", "load_dependent"):
-            effect.size *= float(rng.choice([-1.0, 1.0])) if name == "asymmetric_friction" else 1.0
+        if name == "asymmetric_friction":
+            effect.size *= float(rng.choice([-1.0, 1.0]))
         found.append(effect)
     return tuple(found)
 

@@ -49,7 +49,8 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
     found = jaxid.discover(start, fitting, validate=held_out, progress=False)
     took = {"took": time.perf_counter() - started, "cpu": time.process_time() - cpu}
     story = {**found.to_dict(), **took}
-    marks = judge(case, wanted.kind, story, _floor(found.loop, case, held_out))
+    noise = case.recordings["held_out"]["noise"]
+    marks = judge(case, wanted.kind, story, floor_percent(found.loop, noise, held_out))
     record = {"truth": sim.truth(case), "marks": marks, "story": story}
     record["truth"]["classes"] = [type(e).__name__ for e in case.effects]
     steps = range(len(found.steps))
@@ -64,11 +65,17 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
     return record
 
 
-def _floor(loop: jaxid.ClosedLoop, case: sim.Case, held_out: jaxid.Recordings) -> np.ndarray:
-    """Relative error by joint that noise leaves of the held-out recording as it is compared, %."""
-    signals = case.recordings["held_out"]["noise"], np.asarray(held_out[0].tau)
-    noise, torque = (compared(loop, held_out, [x])[0] for x in signals)
-    return 100 * np.linalg.norm(noise, axis=0) / np.linalg.norm(torque, axis=0)
+def floor_percent(
+    loop: jaxid.ClosedLoop, noise: np.ndarray, held_out: jaxid.Recordings
+) -> np.ndarray:
+    """Relative error by joint that noise leaves of the held-out recording as it is compared, %.
+
+    **Arguments:**
+
+    - `noise`: in the recorded torque, `(samples, joints)`, N·m or N.
+    """
+    left, torque = (compared(loop, held_out, [x])[0] for x in (noise, np.asarray(held_out[0].tau)))
+    return 100 * np.linalg.norm(left, axis=0) / np.linalg.norm(torque, axis=0)
 
 
 def _seen(

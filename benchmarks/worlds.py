@@ -26,9 +26,8 @@ import jaxid
 from jaxid.storage.campaign import Campaign, Failed
 
 from ._world_cases import KINDS, LAWS, Case, Wanted, draw_wanted, make, read_case, start_model
-from ._world_floor import floor_percent
 from ._world_physics import ROBOTS
-from .hidden_effects import configure_jax
+from .hidden_effects import configure_jax, floor_percent
 
 
 def run_case(wanted: Wanted) -> dict[str, Any]:
@@ -50,7 +49,7 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
     found = jaxid.discover(start, fitting, validate=held_out, progress=False)
     took = {"took": time.perf_counter() - started, "cpu": time.process_time() - cpu}
     story = found.to_dict()
-    floor = floor_percent(case, held_out, found.loop)
+    floor = floor_percent(found.loop, case.recordings["held_out"]["noise"], held_out)
     return {
         "truth": [
             {"effect": e.name, "joint": e.joint + 1, "size": e.size, **e.drawn} for e in case.hidden

@@ -76,9 +76,11 @@ def against(held: Comparison, where: Verdict, model: str) -> Markup:
         kept = np.isin(np.asarray(run.time), held.judged(k)[0])
         kind = curve.coordinate
         way = run.time if kind == "t" else np.asarray(getattr(run, kind))[:, curve.of - 1]
-        x.append(np.asarray(way)[kept])
         sign = np.sign(np.asarray(run.v)[kept, joint - 1]) if curve.signed else 1.0
-        y.append(rest[:, joint - 1] * sign)
+        # Where the joint stands still nothing was compared.
+        moves = rest[:, joint - 1] != 0
+        x.append(np.asarray(way)[kept][moves])
+        y.append((rest[:, joint - 1] * sign)[moves])
     name = curve.spoken_coordinate
     signed = " × sign of velocity" if curve.signed else ""
     torque, position = held.loop.arm.units()

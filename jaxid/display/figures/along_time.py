@@ -87,7 +87,7 @@ def comparison(
         figure.update_yaxes(title_text=with_unit("residual", units[joint]), row=row + 1, col=1)
         figure.update_yaxes(title_text="autocorrelation", range=[-reach, reach], row=row, col=2)
         drawn += upper + lower
-    shade_gaps(figure, time, drawn)
+    shade_gaps(figure, time, drawn, "not compared")
     for row in range(1, 2 * joints + 1):
         # An axis that matches itself is what plotly warns of in a browser's console.
         figure.update_xaxes(matches="x" if row > 1 else None, showticklabels=False, row=row, col=1)

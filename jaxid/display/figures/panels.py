@@ -102,7 +102,9 @@ def band_trace(name: str, x: np.ndarray, lower: np.ndarray, upper: np.ndarray) -
     return go.Scatter(x=around_x, y=around_y, name=name, mode="lines", line=line, **fill)
 
 
-def shade_gaps(figure: go.Figure, time: np.ndarray, traces: Sequence[Trace]) -> None:
+def shade_gaps(
+    figure: go.Figure, time: np.ndarray, traces: Sequence[Trace], name: str = "no data"
+) -> None:
     """Shade in the left column where the measured signals (or all, if none is) are all missing."""
     measured = [trace for trace in traces if trace.role == "measured"] or traces
     missing = np.ones(len(time), dtype=bool)
@@ -115,7 +117,7 @@ def shade_gaps(figure: go.Figure, time: np.ndarray, traces: Sequence[Trace]) -> 
         figure.add_vrect(fillcolor=SHADE, layer="below", **edges, **column)
     if gaps:
         square = {"symbol": "square", "size": 12, "color": SHADE}
-        figure.add_scatter(x=[None], y=[None], name="no data", mode="markers", marker=square)
+        figure.add_scatter(x=[None], y=[None], name=name, mode="markers", marker=square)
 
 
 def _jumps(time: np.ndarray) -> np.ndarray:
