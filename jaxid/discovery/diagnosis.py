@@ -20,6 +20,7 @@ from ..noise import ARFilter
 from ..parameters import write_values
 from ..storage.saved import save
 from .comparison import Comparison
+from .floor import Floor
 from .hypotheses import Hypothesis, amplitudes, on_recordings
 from .score import Data, Gram
 from .separate import leftover
@@ -62,6 +63,7 @@ class Diagnosis(AbstractShown):
     - `pair`: two entries that together explain more than the best curve, where none does alone.
     - `noise`: the noise filter of each output.
     - `floor`: relative error that a model with every effect and curve that matters leaves, %.
+    - `measured`: the noise floor from the recordings alone, as far as they tell it.
     - `unexplained`: by how much that model's score is better than that of the fit.
     """
 
@@ -79,6 +81,7 @@ class Diagnosis(AbstractShown):
     tests: float
     significance: float = 0.01
     unexplained: float = 0.0
+    measured: Floor | None = None
 
     @property
     def best(self) -> AbstractEffect:
@@ -305,8 +308,25 @@ class Diagnosis(AbstractShown):
         ]
 
     def floor_percent(self) -> Float[np.ndarray, " joints"]:
-        """Relative error that a perfect model would leave on the fitted recordings, %."""
-        return over_recordings(self.floor)
+        """Relative error that a perfect model would leave on the fitted recordings, %.
+
+        By what the recordings alone tell of their noise where they do, else by a model with every
+        effect and curve that matters.
+        """
+        if self.measured is None:
+            return over_recordings(self.floor)
+        return over_recordings(
+            np.where(np.isfinite(self.measured.percent), self.measured.percent, self.floor)
+        )
+
+    def floor_sources(self) -> tuple[tuple[str, ...], ...]:
+        """By joint, where the noise floor is from: ways to measure it, or "rich model"."""
+        if self.measured is None:
+            return (("rich model",),) * self.floor.shape[1]
+        return tuple(
+            tuple(dict.fromkeys(source or "rich model" for source in column))
+            for column in zip(*self.measured.sources, strict=True)
+        )
 
     def __repr__(self) -> str:
         table = self.table().head(12)

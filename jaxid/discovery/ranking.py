@@ -12,6 +12,7 @@ from ..errors import FitError
 from ..estimate import Fit
 from .comparison import Comparison
 from .diagnosis import Diagnosis, Verdict, share_left
+from .floor import floor_of
 from .hypotheses import Hypothesis
 from .likelihood import score
 from .linear import at_rows
@@ -88,6 +89,7 @@ def _judged(fit: Fit | Comparison, screened: Screened, significance: float) -> D
         tests=tests,
         significance=significance,
         unexplained=plain.value - with_all.value,
+        measured=floor_of(fit.loop, fit.recordings),
     )
 
 

@@ -20,6 +20,7 @@ from ..simulation.loop import ClosedLoop
 from ..storage.saved import save
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
+from .floor import SPOKEN
 from .hypotheses import effect_on, on_recordings
 from .landscape import form
 from .models import Model, models_table, named, picked
@@ -224,6 +225,19 @@ class Discovery(AbstractShown):
         """Relative error that a perfect model would leave on the fitted recordings, %."""
         return self.diagnosis.floor_percent()
 
+    def _floor(self) -> list[str]:
+        """The noise floor by joint, its interval where it was measured, and its source."""
+        measured, shown = self.diagnosis.measured, []
+        for j, value in enumerate(self.noise_floor_percent()):
+            interval = ""
+            if measured is not None and np.isfinite(measured.percent[:, j]).all():
+                low, high = (over_recordings(x)[j] for x in (measured.low, measured.high))
+                interval = f" ({low:.3f} to {high:.3f})"
+            shown.append(f"{value:.3f}{interval}")
+        sources = dict.fromkeys(s for joint in self.diagnosis.floor_sources() for s in joint)
+        said = " and ".join(SPOKEN[s] for s in sources)
+        return [f"noise floor, %: {', '.join(shown)}", f"  {said}"]
+
     def suggestion(self) -> Curve:
         """The free-form curve that explains most of what is left, ready to be added.
 
@@ -271,6 +285,7 @@ class Discovery(AbstractShown):
             "depends_on": self.diagnosis.depends_on() if outside else [],
             "error_percent": {"before": _errors(first), "after": _errors(last)},
             "noise_floor_percent": self.noise_floor_percent().tolist(),
+            "noise_floor_source": [list(s) for s in self.diagnosis.floor_sources()],
             "sentence": self.sentence,
             "removed": [{"effect": n, "joint": j} for n, j in self.removed],
             "models": [m.to_dict(self.considered[0].score) for m in self.considered],
@@ -281,8 +296,7 @@ class Discovery(AbstractShown):
     def __repr__(self) -> str:
         lines = [f"{self.verdict}: {self.sentence}", "relative error, %:"]
         lines.append(self.table().to_string(float_format=lambda x: f"{x:.3f}"))
-        floor = ", ".join(f"{x:.3f}" for x in self.noise_floor_percent())
-        lines.append(f"noise floor, %: {floor}")
+        lines += self._floor()
         for k, step in enumerate(s for s in self.steps if s.added is not None):
             values = _found_parameters(self.steps, k)
             shown = ", ".join(

@@ -9,10 +9,12 @@ from jaxtyping import Float
 from ..estimate import Fit, Status
 from ..estimate.result import joint_columns
 from ..noise import ARFilter
+from ..simulation.dynamics import imposed
 from .causes import likely_cause
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
 from .explore import DECISIVE
+from .floor import SPOKEN, Floor, floor_of
 from .models import LIKELY, Model
 from .score import spanned
 from .system import System
@@ -22,6 +24,9 @@ Outcome = Literal["adequate", "explained", "outside_catalogue", "undetermined"]
 # Error over what noise predicts from which a model is refuted: recordings of one arm differ in
 # their noise by a few per cent, and a tenth more error is seen in a figure.
 _REFUTED = 1.10
+# The same where the law is unknown: both signals have passed filters, which the motion's noise, the
+# ticks of the law and stiction pass as well.
+_BLURRED = 1.30
 # Standard deviations that such an excess must be above chance.
 _SURE = 4.0
 # Share of a joint's torque in % that a model of a robot does not leave, and power of a residual
@@ -91,11 +96,16 @@ def refuted(
         _explains_little(chosen, noise)
         or _apart_in_time(chosen, diagnosis, worth)
         or _above_floor(chosen, diagnosis, worth)
+        or _above_measured(chosen, diagnosis.measured, worth)
     )
     if held_out is None or reason:
         return reason
     before, after = held_out
-    return _risen(before, after, noise) or _above_noise(chosen, after, noise, worth)
+    return (
+        _risen(before, after, noise)
+        or _above_noise(chosen, after, noise, worth)
+        or _above_measured(after, floor_of(after.loop, after.recordings), worth)
+    )
 
 
 def _explains_little(fit: Fit, noise: Sequence[ARFilter]) -> str:
@@ -161,6 +171,26 @@ def _above_floor(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
         f"on the fitted recordings it leaves {left[worst]:.3g} % of {label}, of which noise "
         f"accounts for {by_noise[worst]:.3g} %: neither the catalogue nor a curve of one "
         "coordinate explains the difference"
+    )
+
+
+def _above_measured(fit: Fit | Comparison, floor: Floor | None, worth: float) -> str:
+    """Whether a joint is left with more than the noise that its recordings show without a model."""
+    if floor is None:
+        return ""
+    left = fit.error_percent.to_numpy()
+    limit = _BLURRED if imposed(fit.loop) else _REFUTED
+    matters = left**2 - np.nan_to_num(floor.percent) ** 2 > worth**2
+    ratio = np.where(matters & (left > limit * floor.high), left / floor.percent, 0.0)
+    if not np.any(ratio > limit):
+        return ""
+    r, j = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+    return (
+        f"on {fit.recordings.names[r]} it leaves {left[r, j]:.3g} % of "
+        f"{joint_columns(fit.loop.joints)[j]}, where the noise of the torque is "
+        f"{floor.low[r, j]:.3g} to {floor.high[r, j]:.3g} % "
+        f"({SPOKEN[floor.sources[r][j]]}): neither the catalogue nor a curve of one coordinate "
+        "explains the difference"
     )
 
 

@@ -5,6 +5,9 @@ from .ar import Criterion as Criterion
 from .ar import check_series as check_series
 from .ar import fit_ar as fit_ar
 from .ar import orders as orders
+from .floor import Level as Level
+from .floor import above_motion as above_motion
+from .floor import from_repeats as from_repeats
 from .vector import Noise as Noise
 from .vector import VectorAR as VectorAR
 from .vector import fit_var as fit_var

@@ -81,7 +81,7 @@ def inspect(recordings: Recording | Recordings | Iterable[Recording]) -> Inspect
     return Inspection(
         pd.DataFrame(signals).set_index("recording"),
         table,
-        _repeats(recordings),
+        repeated(recordings),
         tuple(_notes(recordings, table)),
     )
 
@@ -126,7 +126,13 @@ def _by_joint(r: Recording, cutoff: float) -> list[dict[str, Any]]:
     return rows
 
 
-def _repeats(recordings: Recordings) -> tuple[tuple[str, str], ...]:
+def repeated(recordings: Recordings) -> tuple[tuple[str, str], ...]:
+    """Names of recordings that follow the same reference, or the same motion where none is given.
+
+    **Arguments:**
+
+    - `recordings`: of one robot.
+    """
     found = []
     for k, one in enumerate(recordings):
         for other in list(recordings)[k + 1 :]:

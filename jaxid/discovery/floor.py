@@ -1,0 +1,74 @@
+"""The noise floor of a fit from its recordings alone: what no model of the robot can explain."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..control import OpenLoop, Tracking
+from ..noise import Level, above_motion, from_repeats
+from ..recording import Recordings
+from ..signals.smoothing import signal_cutoff
+from ..simulation.batch import band_of, compared
+from ..simulation.loop import ClosedLoop
+
+# What each source is called in a sentence.
+SPOKEN = {
+    "repeats": "from recordings that repeat a reference",
+    "above the motion": "from the torque above the motion's frequencies",
+    "rich model": "from a model with every effect that matters",
+}
+
+
+class Floor(eqx.Module):
+    """Relative error by recording and joint that the noise of the recorded torque leaves, %.
+
+    - `percent`, `low`, `high`: its estimate and 95 % interval; not a number where the recordings do
+      not tell it.
+    - `sources`: by recording and joint, "repeats" or "above the motion"; empty where not told.
+    """
+
+    percent: Float[np.ndarray, "recordings joints"]
+    low: Float[np.ndarray, "recordings joints"]
+    high: Float[np.ndarray, "recordings joints"]
+    sources: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+
+
+def floor_of(loop: ClosedLoop, recordings: Recordings) -> Floor | None:
+    """The noise floor of what is compared, from repeats of a reference or above the motion.
+
+    None where positions are compared.
+
+    **Arguments:**
+
+    - `loop`: its controller says what is compared; its model does not enter.
+    """
+    if isinstance(loop.controller, OpenLoop):
+        return None
+    repeats = from_repeats(recordings, lambda pair, rows: compared(loop, pair, list(rows)))
+    band = band_of(loop, recordings)
+    torque = compared(loop, recordings, [r.tau for r in recordings])
+    levels: list[tuple[Level | None, ...]] = []
+    for k, r in enumerate(recordings):
+        cutoff = loop.controller.comparable(r) or signal_cutoff(r)
+        moving = Tracking().moving(r, cutoff)
+        assert moving is not None
+        share = 1.0 if band is None else float(np.mean(np.asarray(band.gain[k]) ** 2))
+        above = above_motion(r, cutoff, moving, share)
+        levels.append(repeats.get(r.name, above))
+    return _relative(levels, torque)
+
+
+def _relative(levels: Sequence[tuple[Level | None, ...]], torque: Sequence[np.ndarray]) -> Floor:
+    """Levels over the size of the torque that is compared; its rows are zero where none is."""
+    shape = len(levels), len(levels[0])
+    numbers = np.full((3, *shape), np.nan)
+    for k, (row, tau) in enumerate(zip(levels, torque, strict=True)):
+        for j, level in enumerate(row):
+            there, size = np.count_nonzero(tau[:, j]), np.linalg.norm(tau[:, j])
+            if level is not None and size > 0:
+                values = np.array([level.value, level.low, level.high])
+                numbers[:, k, j] = 100 * values * np.sqrt(there) / size
+    sources = tuple(tuple("" if x is None else x.source for x in row) for row in levels)
+    return Floor(*numbers, sources)

@@ -1,0 +1,148 @@
+"""Noise of recorded torque without a model of the robot: from repeats, or above the motion."""
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..recording import Recording, Recordings
+from ..signals.inspection import repeated
+from ..signals.smoothing import low_pass
+
+Source = Literal["repeats", "above the motion"]
+Compared = Callable[[Sequence[Recording], Sequence[np.ndarray]], Sequence[np.ndarray]]
+
+# The low-pass of a motion has let go at this multiple of its cutoff. Towards half the sample rate
+# loggers have filters of their own.
+_ABOVE, _UNTIL = 1.5, 0.9
+# Samples of a window of the spectrum, windows and frequencies that say something.
+_WINDOW, _WINDOWS, _BINS = 64, 6, 6
+# Log of the power in the lower half of the frequencies over that in the upper half, and standard
+# deviations of it, from which noise is not called white; a deviation that is larger tells nothing.
+_COLOURED, _SURE, _UNSURE = 0.15, 2.0, 0.2
+
+
+class Level(eqx.Module):
+    """Deviation of the noise of a joint's torque as it is compared, and its 95 % interval.
+
+    - `value`, `low`, `high`: N·m or N.
+    """
+
+    value: float
+    low: float
+    high: float
+    source: Source = eqx.field(static=True)
+
+
+def above_motion(
+    recording: Recording,
+    cutoff: float,
+    moving: Bool[np.ndarray, "samples joints"],
+    share: float,
+) -> tuple[Level | None, ...]:
+    """Noise by joint from the torque's spectrum above the motion, where noise is white there.
+
+    No rigid arm's torque is there, and none of friction's while a joint keeps its direction. What
+    is white above the motion's frequencies is taken to be so below them. Noise that is not is no
+    guide to lower frequencies, and None is returned.
+
+    **Arguments:**
+
+    - `cutoff`: frequency up to which the motion is known, Hz.
+    - `moving`: at which samples a joint moves without a turn nearby; windows of those are used.
+    - `share`: of the power of white noise that is left in what is compared.
+    """
+    import scipy
+
+    grid = np.fft.rfftfreq(_WINDOW, recording.period)
+    used = (grid >= _ABOVE * cutoff) & (grid < _UNTIL * recording.rate / 2)
+    if used.sum() < _BINS or recording.samples < 4 * _WINDOW:
+        return (None,) * recording.joints
+    # Windows leak what is a thousand times as strong below.
+    high = recording.tau - low_pass(recording.tau, recording.rate, cutoff)
+    taper = np.asarray(scipy.signal.get_window("hann", _WINDOW))
+    first = np.arange(0, recording.samples - _WINDOW + 1, _WINDOW // 2)
+    rows = first[:, None] + np.arange(_WINDOW)
+    power = np.abs(np.fft.rfft(high[rows] * taper[:, None], axis=1)) ** 2 / np.sum(taper**2)
+    there = moving[rows].all(axis=1)
+    return tuple(_white(power[there[:, j]][:, used, j], share) for j in range(recording.joints))
+
+
+def _white(power: Float[np.ndarray, "windows bins"], share: float) -> Level | None:
+    """Level of white noise from its spectrum in windows; None where it is not white."""
+    if len(power) < _WINDOWS:
+        return None
+    lower, upper = (part.mean(axis=1) for part in np.array_split(power, 2, axis=1))
+    if min(lower.mean(), upper.mean()) <= 0:
+        return None
+    slope = np.log(lower.mean() / upper.mean())
+    chance = np.hypot(_relative(lower), _relative(upper))
+    if chance > _UNSURE or (abs(slope) > _COLOURED and abs(slope) > _SURE * chance):
+        return None
+    mean, spread = share * power.mean(), _relative(power.mean(axis=1))
+    # What a colour that does not show yet may do at lower frequencies.
+    reach = 2 * np.hypot(spread, max(abs(slope), chance))
+    value = np.sqrt(mean)
+    return Level(value, value * np.exp(-reach / 2), value * np.exp(reach / 2), "above the motion")
+
+
+def _relative(x: Float[np.ndarray, " windows"]) -> float:
+    """Relative deviation of a mean of windows that overlap by half, bursts included."""
+    return float(np.std(x) / (np.mean(x) * np.sqrt(0.6 * len(x))))
+
+
+def from_repeats(recordings: Recordings, compared: Compared) -> dict[str, tuple[Level, ...]]:
+    """Noise by joint of recordings that repeat a reference, by name, from their difference.
+
+    Half of the power of the difference is the noise of each, once what is linear in the difference
+    of the joint's motion is taken off. What else the robot does differently is part of it: no model
+    tells that from noise.
+
+    **Arguments:**
+
+    - `compared`: what is compared of signals of two recordings, zero where nothing is.
+    """
+    named = {r.name: r for r in recordings}
+    found: dict[str, tuple[Level, ...]] = {}
+    for one, other in repeated(recordings):
+        length = min(named[one].samples, named[other].samples)
+        pair = [_first(named[name], length) for name in (one, other)]
+        apart = []
+        for both in zip(*((r.tau, *_motion(r)) for r in pair), strict=True):
+            mine, its = compared(pair, both)
+            apart.append(np.where((mine != 0) & (its != 0), mine - its, 0.0))
+        torque, *motion = apart
+        levels = tuple(
+            _of_difference(torque[:, j], np.stack([x[:, j] for x in motion], axis=1))
+            for j in range(recordings.joints)
+        )
+        for name in (one, other):
+            found.setdefault(name, levels)
+    return found
+
+
+def _first(r: Recording, samples: int) -> Recording:
+    return r if r.samples == samples else r.slice(None, r.time[samples])
+
+
+def _motion(r: Recording) -> tuple[Float[np.ndarray, "samples joints"], ...]:
+    """Position from where it begins, velocity and acceleration; with the encoder's noise."""
+    q = r.q - r.q[:1]
+    v = np.gradient(q, r.period, axis=0)
+    return q, v, np.gradient(v, r.period, axis=0)
+
+
+def _of_difference(
+    torque: Float[np.ndarray, " rows"], motion: Float[np.ndarray, "rows signals"]
+) -> Level:
+    there = torque != 0
+    x, y = motion[there], torque[there]
+    rest = y - x @ np.linalg.lstsq(x, y, rcond=None)[0] if len(y) else y
+    value = float(np.sqrt(np.sum(rest**2) / (2 * max(len(rest) - x.shape[1], 1))))
+    # Frequencies that share the power: noise that follows itself has fewer than rows.
+    power = np.abs(np.fft.rfft(rest)) ** 2
+    freedom = max(2 * float(np.sum(power)) ** 2 / max(float(np.sum(power**2)), 1e-300), 1.0)
+    reach = 1.96 / np.sqrt(2 * freedom)
+    return Level(value, value * np.exp(-reach), value * np.exp(reach), "repeats")

@@ -1,0 +1,96 @@
+"""The noise of recorded torque, told without a model of the robot."""
+
+import numpy as np
+import pytest
+import scipy
+
+import jaxid
+from jaxid.control import Tracking
+from jaxid.discovery.floor import floor_of
+from jaxid.noise import above_motion
+from jaxid.simulation.batch import compared
+
+RATE, DURATION = 250.0, 16.0
+
+
+def axis(seed: int, noise: str = "white", level: float = 0.02, name: str = "axis"):
+    """A slide with dry friction, its torque in closed form; the recording and its noise."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0, DURATION, 1 / RATE)
+    q, v, a = np.zeros((3, len(time)))
+    for f, size in ((0.31, 0.3), (0.83, 0.1), (1.7, 0.03)):
+        w = 2 * np.pi * f
+        q += size * np.sin(w * time)
+        v += size * w * np.cos(w * time)
+        a -= size * w**2 * np.sin(w * time)
+    clean = 2.0 * a + 0.8 * v + 1.5 * np.tanh(v / 0.005)
+    white = rng.standard_normal(len(time))
+    if noise == "coloured":
+        white = scipy.signal.lfilter([0.6], [1.0, -0.8], white)
+    errors = level * np.std(clean) * white
+    tau = (clean + errors)[:, None]
+    record = jaxid.Recording.from_arrays(time, q[:, None], tau, name=name)
+    return record, errors[:, None]
+
+
+def percent(noise, record, loop) -> np.ndarray:
+    """The noise's share of the torque as it is compared, %."""
+    left, whole = (compared(loop, [record], [x])[0] for x in (noise, record.tau))
+    return 100 * np.linalg.norm(left, axis=0) / np.linalg.norm(whole, axis=0)
+
+
+@pytest.fixture(scope="module")
+def known():
+    return jaxid.robots.emps()
+
+
+def unknown(*records: jaxid.Recording) -> jaxid.ClosedLoop:
+    law = Tracking().settled(records)
+    return jaxid.robots.emps(law)
+
+
+def test_white_noise_is_told_from_what_is_above_the_motion(known):
+    ratios, inside = [], []
+    for seed in range(12):
+        record, noise = axis(seed)
+        for loop in (known, unknown(record)):
+            floor = floor_of(loop, jaxid.Recordings.of(record))
+            assert floor is not None
+            assert floor.sources == (("above the motion",),)
+            truth = percent(noise, record, loop)
+            ratios.append(floor.percent[0] / truth)
+            inside.append((floor.low[0] < truth) & (truth < floor.high[0]))
+    ratios = np.array(ratios)
+    assert abs(np.median(ratios) - 1) < 0.05
+    assert np.mean(abs(ratios - 1) < 0.15) > 0.9
+    assert np.mean(inside) > 0.85
+
+
+def test_coloured_noise_is_no_guide(known):
+    told = [
+        floor_of(known, jaxid.Recordings.of(axis(seed, "coloured")[0])).sources for seed in range(8)
+    ]
+    assert told == [(("",),)] * 8
+
+
+def test_recordings_that_repeat_a_reference_tell_coloured_noise_as_well(known):
+    ratios, inside = [], []
+    for seed in range(12):
+        pair = [axis(100 * k + seed, "coloured", name=f"run {k}") for k in (1, 2)]
+        records = [record for record, _ in pair]
+        for loop in (known, unknown(*records)):
+            floor = floor_of(loop, jaxid.Recordings.of(records))
+            assert floor.sources == (("repeats",), ("repeats",))
+            truth = np.mean([percent(noise, record, loop) for record, noise in pair], axis=0)
+            ratios.append(floor.percent[0] / truth)
+            inside.append((floor.low[0] < truth) & (truth < floor.high[0]))
+    assert abs(np.median(ratios) - 1) < 0.05
+    assert np.mean(inside) > 0.85
+
+
+def test_a_joint_that_never_moves_freely_tells_nothing():
+    record, _ = axis(1)
+    moving = np.zeros((record.samples, 1), bool)
+    assert above_motion(record, 10.0, moving, 1.0) == (None,)
+    # Nor do samples that hardly reach above the motion.
+    assert above_motion(record, 0.4 * RATE, ~moving, 1.0) == (None,)
