@@ -10,7 +10,8 @@ import pytest
 from independent import effects as fx
 
 import jaxid
-from jaxid.discovery.search import Asked, Search
+from jaxid.discovery.asked import Asked
+from jaxid.discovery.search import Search
 from jaxid.discovery.story import Step
 from jaxid.effects import AbstractEffect, Motion, on_joint
 from jaxid.parameters import Scalar, parameter

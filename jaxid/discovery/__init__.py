@@ -1,5 +1,6 @@
 """Where the model fails and what is missing: compare, diagnose, discover."""
 
+from ._discover import discover as discover
 from .comparison import Comparison as Comparison
 from .comparison import compare as compare
 from .diagnosis import Diagnosis as Diagnosis
@@ -9,5 +10,4 @@ from .fleet import Fleet as Fleet
 from .fleet import FleetRobot as FleetRobot
 from .fleet import discover_all as discover_all
 from .screening import diagnose as diagnose
-from .search import discover as discover
 from .story import Discovery as Discovery

@@ -13,7 +13,7 @@ from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign, Failed
 from ..storage.classes import classes_of
-from .search import discover
+from ._discover import discover
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -114,7 +114,7 @@ class Predictor(eqx.Module):
         return self._ended(found)
 
     def _reached(self, effects: tuple[AbstractEffect, ...]) -> "_Reached":
-        shown = [self._shown(effect) for effect in effects]
+        shown = [self.shown(effect) for effect in effects]
         none = np.zeros((*self.data.residual.shape, 1))
         value = sum((s[..., 0] for s in shown), none[..., 0])
         slopes = np.concatenate([none[..., 1:], *(s[..., 1:] for s in shown)], axis=-1)
@@ -147,7 +147,7 @@ class Predictor(eqx.Module):
         )
         return _Reached(effects, value, slopes, white, taken, sums, np.asarray(loss))
 
-    def _shown(
+    def shown(
         self, effect: AbstractEffect
     ) -> Float[np.ndarray, "recordings samples outputs columns"]:
         """What an effect does to the output, N·m or N (rad or m in an open loop), and its slopes.

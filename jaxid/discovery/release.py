@@ -1,6 +1,7 @@
 """Values that a model holds by default, in doubt: a smoothing, the delay of recorded torque."""
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
@@ -13,6 +14,7 @@ from ..simulation.integration import SIGNALS
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate_batch
 from .predict import Predictor
+from .score import spanned
 
 # A value above zero is tried so many times larger and smaller.
 _FACTOR = 5.0
@@ -20,7 +22,7 @@ _FACTOR = 5.0
 _SIGN = "smoothing", "form"
 _SIGNS = {(what,) for what in _SIGN}
 # Samples by which torque may be late as the commands of a sampled law are; more is a mistake in the
-# recordings. Changes of less than this share of a sample are not worth a fit.
+# recordings. Changes of less than this share of a sample, or of a scale, are not worth a fit.
 _LATE, _NOTHING = 2.0, 0.02
 
 
@@ -29,12 +31,14 @@ class Release(eqx.Module):
 
     - `gain`: by how much the score is predicted to fall.
     - `freedom`: values that were estimated and are not among the loop's parameters.
+    - `again`: whether all of them were estimated before, and are estimated from elsewhere.
     """
 
     loop: ClosedLoop
     said: str
     gain: float
     freedom: int = 0
+    again: bool = False
 
 
 def released(predictor: Predictor, price: float) -> Release | None:
@@ -51,9 +55,13 @@ def released(predictor: Predictor, price: float) -> Release | None:
     if values:
         held = [p.name for p in doubtful(loop) if p.name in values]
         free = loop.with_values(**values).free(*held)
-        change = _signal(predictor, loop.with_values(**values)) - nominal
-        gain = _fall(predictor, _gain(predictor, change))
-        return Release(free, f"{' and '.join(held)} estimated", gain)
+        if held:
+            change = _signal(predictor, loop.with_values(**values)) - nominal
+            gain = _fall(predictor, _gain(predictor, change))
+            return Release(free, f"{' and '.join(held)} estimated", gain)
+        start = ", ".join(f"{name} {value:.3g}" for name, value in values.items())
+        least = _fall(predictor, price)
+        return Release(free, f"estimates that begin at {start}", least, again=True)
     late, gain = _lateness(predictor, nominal, price)
     if late == 0:
         return None
@@ -74,18 +82,49 @@ def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str
     loop = predictor.system.loop
     names = {p.place: p.name for p in loop.parameters}
     found: dict[str, float] = {}
-    for p in doubtful(loop):
+    for p in (*doubtful(loop), *_estimated_signs(loop)):
         if p.name in found:
             continue
         together = [names[(*p.place[:2], what)] for what in _SIGN if p.place[2:] in _SIGNS]
+        gain = _gain if p.place not in {q.place for q in loop.free_parameters} else _instead(p)
         best: dict[str, float] = {}
         most = price
         for values in _settings(p, together, loop):
             change = _signal(predictor, loop.with_values(**values)) - nominal
-            if np.isfinite(change).all() and (gain := _gain(predictor, change)) > most:
-                best, most = values, gain
+            if np.isfinite(change).all() and (explained := gain(predictor, change)) > most:
+                best, most = values, explained
         found |= best
     return found
+
+
+def _estimated_signs(loop: ClosedLoop) -> list[Parameter]:
+    """Smoothings and forms that are estimated along an imposed motion.
+
+    Their values may be a minimum that was the best before an effect was there.
+    """
+    if not imposed(loop):
+        return []
+    return [p for p in loop.free_parameters if p.place[2:] in _SIGNS and not _follows(p, loop)]
+
+
+def _instead(sign: Parameter) -> Callable[[Predictor, np.ndarray], float]:
+    """What a change of an estimated sign explains in place of what its own derivatives absorb."""
+
+    def gain(predictor: Predictor, change: np.ndarray) -> float:
+        free = predictor.system.loop.free_parameters
+        owner = [p.place[:2] == sign.place[:2] and p.place[2:] in _SIGNS for p in free]
+        gone = np.repeat(owner, [p.size for p in free])
+        base = predictor.data.base
+        kept = base[..., np.concatenate([~gone, np.ones(base.shape[-1] - len(gone), bool)])]
+        white = predictor.data.white(kept, predictor.noise)
+        basis = spanned(white.reshape(-1, white.shape[-1]))
+        seen = _compared(predictor, change)
+        rest = predictor.data.white(predictor.data.residual - seen, predictor.noise).reshape(-1)
+        rest = rest - basis @ (basis.T @ rest)
+        now = _white(predictor, predictor.data.residual)
+        return float(now @ now - rest @ rest)
+
+    return gain
 
 
 def _settings(p: Parameter, together: list[str], loop: ClosedLoop) -> list[dict[str, float]]:
@@ -95,13 +134,16 @@ def _settings(p: Parameter, together: list[str], loop: ClosedLoop) -> list[dict[
     smoothing, form = together
     signs = [q for q in loop.parameters if q.place[2:] in _SIGNS]
     named = {q.name: float(np.asarray(q.where(loop))) for q in signs}
+    # From a bound at nothing no factor leads away.
+    scale = next(q.declaration.scale for q in signs if q.name == smoothing)
+    centre = named[smoothing] if named[smoothing] > _NOTHING * scale else scale
     # Along a given motion a simulation costs next to nothing.
     fine = imposed(loop)
     factors = (0.2, 0.4, 0.7, 1.0, 1.5, 2.5, 5.0) if fine else (0.2, 1.0, 5.0)
     forms = (0.0, 0.3, 0.6, 1.0) if fine else (0.0, 1.0)
-    held = {q.name for q in doubtful(loop)}
+    held = {q.name for q in (*doubtful(loop), *loop.free_parameters)}
     chosen = [
-        {smoothing: named[smoothing] * factor, form: value}
+        {smoothing: centre * factor, form: value}
         for factor in factors
         for value in (forms if form in held else (named[form],))
         if smoothing in held or form in held
@@ -148,11 +190,16 @@ def _gain(predictor: Predictor, change: np.ndarray) -> float:
 
 def _held_against(predictor: Predictor, change: np.ndarray) -> tuple[float, float]:
     """How much of a change is in the residual beside the base, and what that explains."""
-    batch = predictor.system.batch
-    seen = np.asarray(batch.compared(change * np.asarray(batch.mask)[..., None]))
+    seen = _compared(predictor, change)
     shown, residual = (_white(predictor, x) for x in (seen, predictor.data.residual))
     along, size = float(residual @ shown), max(float(shown @ shown), 1e-300)
     return along / size, along**2 / size
+
+
+def _compared(predictor: Predictor, change: np.ndarray) -> np.ndarray:
+    """A change of the simulated signal as it is compared."""
+    batch = predictor.system.batch
+    return np.asarray(batch.compared(change * np.asarray(batch.mask)[..., None]))
 
 
 def doubtful(loop: ClosedLoop) -> list[Parameter]:
@@ -161,11 +208,6 @@ def doubtful(loop: ClosedLoop) -> list[Parameter]:
     The smoothing of an effect follows that of the joint's Coulomb friction, and is none of them.
     """
     free = {p.place for p in loop.free_parameters}
-
-    def follows(p: Parameter) -> bool:
-        effect = loop.effects[int(p.place[1])]
-        return p.place[2:] == ("smoothing",) and not isinstance(effect, Coulomb)
-
     return [
         p
         for p in loop.parameters
@@ -173,8 +215,14 @@ def doubtful(loop: ClosedLoop) -> list[Parameter]:
         and p.size == 1
         and not (p.declaration.free or p.declaration.linear)
         and p.place not in free | loop.held
-        and not follows(p)
+        and not _follows(p, loop)
     ]
+
+
+def _follows(p: Parameter, loop: ClosedLoop) -> bool:
+    """Whether a smoothing is that of the joint's Coulomb friction, which another effect has."""
+    effect = loop.effects[int(p.place[1])] if p.place[0] == "effects" else None
+    return p.place[2:] == ("smoothing",) and not isinstance(effect, Coulomb)
 
 
 def _elsewhere(p: Parameter, loop: ClosedLoop) -> list[float]:

@@ -1,41 +1,32 @@
 """The search for what a model lacks: predict in the linear system, verify by full fits."""
 
 import dataclasses
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
+from itertools import islice
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..control import OpenLoop
-from ..display.progress import working
 from ..effects import AbstractEffect
-from ..effects import catalogue as known
-from ..errors import FitError, ModelError, RecordingError
-from ..estimate import OEM, Fit, Status
-from ..recording import Recording, Recordings
+from ..errors import FitError, ModelError
+from ..estimate import Fit
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
-from ..storage.classes import classes_of
 from .asked import Asked
-from .comparison import compare
 from .diagnosis import Diagnosis, over_recordings, share_left
 from .explore import DECISIVE, Candidate, explore, key_of
 from .hypotheses import effect_on
 from .landscape import Landscape, form, forms_of
 from .likelihood import price, score_of
-from .models import Model, Named, Visited, named, probability, worth_keeping
+from .models import Model, Named, Visited, named
 from .ranking import Screened, judge
 from .release import released
-from .remarks import remarks
 from .screening import screen
-from .story import Discovery, Step
-from .verdict import Outcome, misfit_of, refuted, undecided
+from .support import unsupported
+from .verdict import Outcome
 from .verify import Refits, is_there, needed
 
 # Sets that are refitted in one round, and the share of what the best gains by which predictions
@@ -47,67 +38,6 @@ _AHEAD = 2
 # Share of what a model leaves that an effect must explain where the law is unknown: what filters on
 # motion and torque, ticks and stiction leave is of that size in the best of recordings.
 _BLURRED = 0.25
-# Weight from which a rival's error on held-out recordings is worth a simulation.
-_SHOWN = 0.01
-
-
-def discover(
-    loop: ClosedLoop,
-    recordings: Recording | Recordings | Iterable[Recording],
-    validate: Recording | Recordings | Iterable[Recording] | None = None,
-    *,
-    catalogue: Sequence[Any] = known,
-    method: OEM | None = None,
-    significance: float = 0.01,
-    worth: float = 0.05,
-    most: int = 6,
-    resume: str | Path | None = None,
-    progress: bool = True,
-) -> Discovery:
-    """Finds what the model lacks: the set of effects of the best score.
-
-    Sets are predicted in the linear system along the fitted runs; the best few are fitted in full;
-    and the system is linearised again at the winner, until nothing predicted is better.
-
-    **Arguments:**
-
-    - `loop`: the starting model.
-    - `recordings`: to fit. `validate`: held out; they enter no score.
-    - `catalogue`: as for `diagnose`.
-    - `method`: of the fits.
-    - `significance`: corrected p-value below which a diagnosis says that something is missing.
-    - `worth`: what is worth knowing: an effect must change some joint's torque by this share, %.
-    - `most`: how many effects to add at the most.
-    - `resume`: a folder in which every fit is saved as it ends, and from which the same call
-      goes on; it is made where it is not there.
-
-    **Raises:** `FitError`, `ModelError`, `RecordingError` where model and recordings do not fit;
-    also where they were sampled at different rates; `SaveError` where the folder holds steps of
-    another call.
-    """
-    started = time.perf_counter()
-    judged = "position" if isinstance(loop.controller, OpenLoop) else "torque"
-    if method is not None and method.output not in (None, judged):
-        raise FitError(
-            f"a discovery compares {judged}, by which {loop.name} is judged, and not "
-            f"OEM(output={method.output!r}): leave out output"
-        )
-    recordings = Recordings.of(recordings)
-    held_out = None if validate is None else Recordings.of(validate)
-    Recordings.of([*recordings, *(held_out or ())]).common_period()
-    _check_apart(recordings, held_out or ())
-    asked = Asked(
-        recordings, held_out, method or OEM(), tuple(catalogue), significance, worth, most
-    )
-    with (
-        working(f"discovery on {loop.name}", progress) as say,
-        Campaign(
-            resume, {"loop": loop, "search": asked.plan()}, classes_of(loop) | asked.classes()
-        ) as campaign,
-    ):
-        search = Search(asked, campaign, say)
-        verdict, unfinished = search.run(loop)
-        return search.story(verdict, unfinished, started)
 
 
 class Search:
@@ -208,7 +138,8 @@ class Search:
         model = self._judged(self._added(found), found)
         cost = release.freedom * value
         model = dataclasses.replace(model, score=model.score + cost)
-        if model.score > min(at.score - effect + DECISIVE, at.score):
+        least = DECISIVE if release.again else max(effect - DECISIVE, 0.0)
+        if model.score > at.score - least:
             return None
         self.visited.add(model)
         return model
@@ -223,7 +154,7 @@ class Search:
             # What does no better with more is looked at again from the fit with less.
             keys = [Counter(c.key) for c in near]
             tried = [c for k, c in enumerate(near) if not any(x < keys[k] for x in keys[:k])]
-            tried = tried[:_VERIFIED]
+            tried = list(islice(filter(self._supported, tried), _VERIFIED))
         # Effects that come close to what one curve says better are no explanation.
         alone = [c.score for c in candidates if c.curve is not None and not c.effects]
         gain = nothing - min(alone, default=np.inf)
@@ -235,12 +166,21 @@ class Search:
         self.visited.add_predicted(candidates, at, anchor, self._left_by)
         return None if best is None else best[0]
 
+    def _supported(self, c: Candidate) -> bool:
+        """Whether each effect explains stretches that did not determine it; noted if not."""
+        fit, predictor = self.seen
+        lacking = unsupported(predictor, c) if imposed(fit.loop) else ()
+        if lacking:
+            said = f"{_listed(lacking)}: explains only the stretches from which it is estimated"
+            self.failures = tuple(dict.fromkeys((*self.failures, said)))
+        return not lacking
+
     def _fitted(self, at: Model, asked: Candidate, promised: float) -> Model | None:
         """A set beside a fitted model, fitted in full; None where it does not show."""
         assert at.fit is not None
         before: Fit = at.fit
         together = (*at.effects, *asked.effects)
-        had = self._had(at, together)
+        had = self.had(at, together)
         if had is not None:
             return had
         self.say(f"fit with {_listed(asked.effects)}")
@@ -257,7 +197,7 @@ class Search:
             return None
         return self._visit(self._added(fit), fit)
 
-    def _had(self, at: Model, effects: Sequence[AbstractEffect]) -> Model | None:
+    def had(self, at: Model, effects: Sequence[AbstractEffect]) -> Model | None:
         """The refit of a set, where values that the start held are free in it as they are here."""
         had = self.visited.fitted(effects)
         if had is None or had.fit is None or at.fit is None:
@@ -276,7 +216,7 @@ class Search:
             if needed(at.fit, gone, price(len(at.effects), self.forms)):
                 continue
             less = tuple(e for e in at.effects if e is not gone)
-            found.append(self._had(at, less) or self._refitted(at, less))
+            found.append(self.had(at, less) or self.refitted(at, less))
         best = min(found, key=lambda m: m.score, default=at)
         if best.score < at.score:
             return best
@@ -294,7 +234,7 @@ class Search:
         lost = np.sqrt(np.maximum(less.left**2 - at.left**2, 0.0))
         return bool(np.any(lost > self._worth(at, at.left)))
 
-    def _refitted(self, at: Model, effects: Sequence[AbstractEffect]) -> Model:
+    def refitted(self, at: Model, effects: Sequence[AbstractEffect]) -> Model:
         """A part of a fitted model's effects, fitted from where they are."""
         assert at.fit is not None
         loop, noise = at.fit.loop, at.noise
@@ -372,106 +312,6 @@ class Search:
             return "outside_catalogue", False
         left = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
         return ("explained" if self.at.effects else "adequate"), unfinished and bool(left)
-
-    # --- the story --------------------------------------------------------------------------------
-
-    def story(self, verdict: Outcome, unfinished: bool, started: float) -> Discovery:
-        """What was found, step by step, held against recordings that no fit has seen."""
-        models = self.visited.weighed(self.at)
-        steps = self._steps(models)
-        models = self._held_out(models, steps)
-        reason = "" if unfinished else self._doubt(verdict, steps, models)
-        notes = (*remarks(steps, self.given), *self.failures)
-        if unfinished:
-            notes = (f"stopped after {self.asked.most} effects, as told: raise most", *notes)
-        return Discovery(
-            verdict="undetermined" if reason else verdict,
-            reason=reason,
-            steps=tuple(steps),
-            considered=worth_keeping(models),
-            removed=self.removed,
-            notes=notes,
-            seconds=time.perf_counter() - started,
-            unfinished=unfinished,
-        )
-
-    def _doubt(self, verdict: Outcome, steps: Sequence[Step], models: Sequence[Model]) -> str:
-        """Why the verdict cannot be told; empty where it can."""
-        first, last = steps[0], steps[-1]
-        if verdict == "outside_catalogue":
-            # A curve may explain what a model that explains next to nothing lacks.
-            blind = last.fit.status is Status.misfit and last.fit.error_percent.min(axis=None) > 99
-            return misfit_of(last.fit) if blind else ""
-        both = None
-        if first.held_out is not None and last.held_out is not None:
-            both = first.held_out, last.held_out
-        assert last.diagnosis is not None
-        worth = self.asked.worth
-        refutation = refuted(last.fit, self.at.noise, last.diagnosis, both, worth)
-        return refutation or undecided(models, self.at)
-
-    def _held_out(self, models: Sequence[Model], steps: Sequence[Step]) -> tuple[Model, ...]:
-        """Models with their error on held-out recordings, where they are worth the simulation."""
-        known = {id(s.fit): s.held_out for s in steps}
-        held_out = self.asked.held_out
-        found = []
-        for m in models:
-            if m.fit is not None and id(m.fit) in known:
-                m = dataclasses.replace(m, held_out=known[id(m.fit)])
-            elif m.fit is not None and held_out is not None and m.weight > _SHOWN:
-                m = dataclasses.replace(m, held_out=compare(m.fit, held_out))
-            found.append(m)
-        return tuple(found)
-
-    def _steps(self, weighed: Sequence[Model]) -> list[Step]:
-        """The starting model, and one more effect in each step."""
-        start = self.visited.fitted(())
-        assert start is not None
-        models = [start]
-        for k in range(1, len(self.at.effects)):
-            less = self.at.effects[:k]
-            models.append(self._had(self.at, less) or self._refitted(self.at, less))
-        if self.at.effects:
-            models.append(self.at)
-        steps = []
-        for k, model in enumerate(models):
-            assert model.fit is not None
-            held_out = self.asked.held_out
-            held = None if held_out is None else compare(model.fit, held_out)
-            step = Step(
-                label="start",
-                fit=model.fit,
-                held_out=held,
-                diagnosis=self.diagnoses.get(model.key),
-            )
-            if k:
-                added = model.effects[-1]
-                step = dataclasses.replace(
-                    step,
-                    label=f"+ {effect_on(*named(added))}",
-                    added=added,
-                    alike=self._alike(model, added),
-                    probability=probability(weighed, named(added)),
-                )
-            steps.append(step)
-        return steps
-
-    def _alike(self, model: Model, added: AbstractEffect) -> tuple[Named, ...]:
-        """What could stand in an effect's place, when it was added or in the end."""
-        last = next(e for e in self.at.effects if form(e) == form(added))
-        found = (*self.visited.alike(model, added), *self.visited.alike(self.at, last))
-        return tuple(dict.fromkeys(n for n in found if n not in self.at.names))
-
-
-def _check_apart(recordings: Recordings, held_out: Iterable[Recording]) -> None:
-    """Raises `RecordingError` where what is held out was fitted as well, whatever its name."""
-    for unseen in held_out:
-        for fitted in recordings:
-            if np.array_equal(unseen.q, fitted.q) and np.array_equal(unseen.tau, fitted.tau):
-                raise RecordingError(
-                    f"{unseen.name} is held out and has the samples of {fitted.name}, which is "
-                    "fitted: what judges a model must not have made it"
-                )
 
 
 def _released(loop: ClosedLoop) -> set[str]:

@@ -24,9 +24,9 @@ Outcome = Literal["adequate", "explained", "outside_catalogue", "undetermined"]
 # Error over what noise predicts from which a model is refuted: recordings of one arm differ in
 # their noise by a few per cent, and a tenth more error is seen in a figure.
 _REFUTED = 1.10
-# The same where the law is unknown: both signals have passed filters, which the motion's noise, the
-# ticks of the law and stiction pass as well.
-_BLURRED = 1.30
+# The same where the law is unknown, and how much must be left more, in % of the torque: filters on
+# both signals, the ticks of the law and stiction leave that much beside noise.
+_BLURRED, _BLUR = 1.30, 1.0
 # Standard deviations that such an excess must be above chance.
 _SURE = 4.0
 # Share of a joint's torque in % that a model of a robot does not leave, and power of a residual
@@ -102,7 +102,7 @@ def refuted(
         return reason
     before, after = held_out
     return (
-        _risen(before, after, noise)
+        risen(before, after, noise)
         or _above_noise(chosen, after, noise, worth)
         or _above_measured(after, floor_of(after.loop, after.recordings), worth)
     )
@@ -179,8 +179,8 @@ def _above_measured(fit: Fit | Comparison, floor: Floor | None, worth: float) ->
     if floor is None:
         return ""
     left = fit.error_percent.to_numpy()
-    limit = _BLURRED if imposed(fit.loop) else _REFUTED
-    matters = left**2 - np.nan_to_num(floor.percent) ** 2 > worth**2
+    limit, least = (_BLURRED, max(worth, _BLUR)) if imposed(fit.loop) else (_REFUTED, worth)
+    matters = left**2 - np.nan_to_num(floor.percent) ** 2 > least**2
     ratio = np.where(matters & (left > limit * floor.high), left / floor.percent, 0.0)
     if not np.any(ratio > limit):
         return ""
@@ -194,8 +194,14 @@ def _above_measured(fit: Fit | Comparison, floor: Floor | None, worth: float) ->
     )
 
 
-def _risen(before: Comparison, after: Comparison, noise: Sequence[ARFilter]) -> str:
-    """Whether held-out recordings were described better without what was added."""
+def risen(before: Comparison, after: Comparison, noise: Sequence[ARFilter]) -> str:
+    """Whether held-out recordings were described better without what was added; empty if not.
+
+    **Arguments:**
+
+    - `before`, `after`: comparisons with them, without and with what was added.
+    - `noise`: filters of what the later model leaves, one an output.
+    """
     errors = [over_recordings(c.error_percent.to_numpy()) for c in (before, after)]
     for j, filt in enumerate(noise):
         pairs = [(b[:, j], a[:, j]) for b, a in zip(before.residuals, after.residuals, strict=True)]

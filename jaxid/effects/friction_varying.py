@@ -77,6 +77,10 @@ class PositionDependentFriction(AbstractEffect):
         return on_joint(self.joint, wave * smooth_sign(motion.v[j], self.smoothing), motion)
 
 
+# A lubricant takes minutes to warm. What fades within a second, s, is something else.
+_FASTEST = 1.0
+
+
 class ThermalDrift(AbstractEffect):
     """Friction that relaxes as the joint warms: (Fvt v + Fct sigma(v)) exp(-t/T)."""
 
@@ -85,7 +89,7 @@ class ThermalDrift(AbstractEffect):
     viscous: Scalar = parameter(0.0, symbol="Fvt", unit="N·m·s/rad", scale=0.05)
     coulomb: Scalar = parameter(0.0, symbol="Fct", unit="N·m", scale=0.1)
     time_constant: Scalar = parameter(
-        10.0, symbol="T", unit="s", lower=1e-2, scale=10.0, linear=False
+        10.0, symbol="T", unit="s", lower=_FASTEST, scale=10.0, linear=False
     )
     smoothing: Scalar = smoothing_speed()
 
@@ -93,9 +97,10 @@ class ThermalDrift(AbstractEffect):
     def screened(cls, scene: Scene) -> Iterable["ThermalDrift"]:
         """Time constants from a twentieth of the recordings to twice their length."""
         return [
-            cls(joint=j, time_constant=share * scene.duration, smoothing=scene.smoothed(j))
+            cls(joint=j, time_constant=time, smoothing=scene.smoothed(j))
             for j in scene.joints
-            for share in np.geomspace(0.06, 1.5, 5)
+            for time in scene.duration * np.geomspace(0.06, 1.5, 5)
+            if time > _FASTEST
         ]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:

@@ -1,0 +1,209 @@
+"""`discover`: the search, held against recordings that no fit has seen, and its story."""
+
+import dataclasses
+import itertools
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..control import OpenLoop
+from ..display.progress import working
+from ..effects import AbstractEffect
+from ..effects import catalogue as known
+from ..errors import FitError, RecordingError
+from ..estimate import OEM, Status
+from ..recording import Recording, Recordings
+from ..simulation.loop import ClosedLoop
+from ..storage.campaign import Campaign
+from ..storage.classes import classes_of
+from .asked import Asked
+from .comparison import compare
+from .hypotheses import effect_on
+from .landscape import form
+from .models import Model, Named, named, probability, worth_keeping
+from .remarks import remarks
+from .search import Search
+from .story import Discovery, Step
+from .verdict import Outcome, misfit_of, refuted, risen, undecided
+
+# Weight from which a rival's error on held-out recordings is worth a simulation.
+_SHOWN = 0.01
+
+
+def discover(
+    loop: ClosedLoop,
+    recordings: Recording | Recordings | Iterable[Recording],
+    validate: Recording | Recordings | Iterable[Recording] | None = None,
+    *,
+    catalogue: Sequence[Any] = known,
+    method: OEM | None = None,
+    significance: float = 0.01,
+    worth: float = 0.05,
+    most: int = 6,
+    resume: str | Path | None = None,
+    progress: bool = True,
+) -> Discovery:
+    """Finds what the model lacks: the set of effects of the best score.
+
+    Sets are predicted in the linear system along the fitted runs; the best few are fitted in full;
+    and the system is linearised again at the winner, until nothing predicted is better.
+
+    **Arguments:**
+
+    - `loop`: the starting model.
+    - `recordings`: to fit. `validate`: held out; they enter no score.
+    - `catalogue`: as for `diagnose`.
+    - `method`: of the fits.
+    - `significance`: corrected p-value below which a diagnosis says that something is missing.
+    - `worth`: what is worth knowing: an effect must change some joint's torque by this share, %.
+    - `most`: how many effects to add at the most.
+    - `resume`: a folder in which every fit is saved as it ends, and from which the same call
+      goes on; it is made where it is not there.
+
+    **Raises:** `FitError`, `ModelError`, `RecordingError` where model and recordings do not fit;
+    also where they were sampled at different rates; `SaveError` where the folder holds steps of
+    another call.
+    """
+    started = time.perf_counter()
+    judged = "position" if isinstance(loop.controller, OpenLoop) else "torque"
+    if method is not None and method.output not in (None, judged):
+        raise FitError(
+            f"a discovery compares {judged}, by which {loop.name} is judged, and not "
+            f"OEM(output={method.output!r}): leave out output"
+        )
+    recordings = Recordings.of(recordings)
+    held_out = None if validate is None else Recordings.of(validate)
+    Recordings.of([*recordings, *(held_out or ())]).common_period()
+    _check_apart(recordings, held_out or ())
+    asked = Asked(
+        recordings, held_out, method or OEM(), tuple(catalogue), significance, worth, most
+    )
+    with (
+        working(f"discovery on {loop.name}", progress) as say,
+        Campaign(
+            resume, {"loop": loop, "search": asked.plan()}, classes_of(loop) | asked.classes()
+        ) as campaign,
+    ):
+        search = Search(asked, campaign, say)
+        verdict, unfinished = search.run(loop)
+        return _told(search, verdict, unfinished, started)
+
+
+def _told(search: Search, verdict: Outcome, unfinished: bool, started: float) -> Discovery:
+    """What was found, step by step, held against recordings that no fit has seen."""
+    models = search.visited.weighed(search.at)
+    steps = _steps(search, models)
+    models = _held_out(search, models, steps)
+    reason = _raised(search, steps)
+    if not unfinished and not reason:
+        reason = _doubt(search, verdict, steps, models)
+    notes = (*remarks(steps, search.given), *search.failures)
+    if unfinished:
+        notes = (f"stopped after {search.asked.most} effects, as told: raise most", *notes)
+    return Discovery(
+        verdict="undetermined" if reason else verdict,
+        reason=reason,
+        steps=tuple(steps),
+        considered=worth_keeping(models),
+        removed=search.removed,
+        notes=notes,
+        seconds=time.perf_counter() - started,
+        unfinished=unfinished,
+    )
+
+
+def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step], models: Sequence[Model]) -> str:
+    """Why the verdict cannot be told; empty where it can."""
+    first, last = steps[0], steps[-1]
+    if verdict == "outside_catalogue":
+        # A curve may explain what a model that explains next to nothing lacks.
+        blind = last.fit.status is Status.misfit and last.fit.error_percent.min(axis=None) > 99
+        return misfit_of(last.fit) if blind else ""
+    both = None
+    if first.held_out is not None and last.held_out is not None:
+        both = first.held_out, last.held_out
+    assert last.diagnosis is not None
+    worth = search.asked.worth
+    refutation = refuted(last.fit, search.at.noise, last.diagnosis, both, worth)
+    return refutation or undecided(models, search.at)
+
+
+def _raised(search: Search, steps: Sequence[Step]) -> str:
+    """Whether effects raised the error on held-out recordings, and which; empty if not."""
+    seen = [(s.label, s.held_out) for s in steps if s.held_out is not None]
+    noise = search.at.noise
+    if len(seen) < 2 or not (reason := risen(seen[0][1], seen[-1][1], noise)):
+        return ""
+    pairs = itertools.pairwise(seen)
+    culprits = [label for (_, one), (label, other) in pairs if risen(one, other, noise)]
+    said = f"; it rose with {' and '.join(x.removeprefix('+ ') for x in culprits)}"
+    return reason + (said if culprits else "")
+
+
+def _held_out(search: Search, models: Sequence[Model], steps: Sequence[Step]) -> tuple[Model, ...]:
+    """Models with their error on held-out recordings, where they are worth the simulation."""
+    known = {id(s.fit): s.held_out for s in steps}
+    held_out = search.asked.held_out
+    found = []
+    for m in models:
+        if m.fit is not None and id(m.fit) in known:
+            m = dataclasses.replace(m, held_out=known[id(m.fit)])
+        elif m.fit is not None and held_out is not None and m.weight > _SHOWN:
+            m = dataclasses.replace(m, held_out=compare(m.fit, held_out))
+        found.append(m)
+    return tuple(found)
+
+
+def _steps(search: Search, weighed: Sequence[Model]) -> list[Step]:
+    """The starting model, and one more effect in each step."""
+    start = search.visited.fitted(())
+    assert start is not None
+    models = [start]
+    for k in range(1, len(search.at.effects)):
+        less = search.at.effects[:k]
+        models.append(search.had(search.at, less) or search.refitted(search.at, less))
+    if search.at.effects:
+        models.append(search.at)
+    steps = []
+    for k, model in enumerate(models):
+        assert model.fit is not None
+        held_out = search.asked.held_out
+        held = None if held_out is None else compare(model.fit, held_out)
+        step = Step(
+            label="start",
+            fit=model.fit,
+            held_out=held,
+            diagnosis=search.diagnoses.get(model.key),
+        )
+        if k:
+            added = model.effects[-1]
+            step = dataclasses.replace(
+                step,
+                label=f"+ {effect_on(*named(added))}",
+                added=added,
+                alike=_alike(search, model, added),
+                probability=probability(weighed, named(added)),
+            )
+        steps.append(step)
+    return steps
+
+
+def _alike(search: Search, model: Model, added: AbstractEffect) -> tuple[Named, ...]:
+    """What could stand in an effect's place, when it was added or in the end."""
+    last = next(e for e in search.at.effects if form(e) == form(added))
+    found = (*search.visited.alike(model, added), *search.visited.alike(search.at, last))
+    return tuple(dict.fromkeys(n for n in found if n not in search.at.names))
+
+
+def _check_apart(recordings: Recordings, held_out: Iterable[Recording]) -> None:
+    """Raises `RecordingError` where what is held out was fitted as well, whatever its name."""
+    for unseen in held_out:
+        for fitted in recordings:
+            if np.array_equal(unseen.q, fitted.q) and np.array_equal(unseen.tau, fitted.tau):
+                raise RecordingError(
+                    f"{unseen.name} is held out and has the samples of {fitted.name}, which is "
+                    "fitted: what judges a model must not have made it"
+                )
