@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import jaxid
 from jaxid.cli import app
-from jaxid.cli.inspecting import guess
+from jaxid.cli.describing import guess
 from jaxid.errors import JaxidWarning, RecordingError
 
 DEMO = Path(jaxid.__file__).parent / "demo" / "hidden"
@@ -58,6 +58,79 @@ def test_what_is_in_a_recording_is_what_was_put_there(tmp_path):
     assert json.loads(json.dumps(found.to_dict()))["repeats"] == [["one", "other"]]
 
 
+def look(q, tau, q_ref=None, time=None):
+    """What is found in one recording of a joint, 1 kHz, and its notes as one text."""
+    time = 1e-3 * np.arange(len(q)) if time is None else time
+    found = jaxid.inspect(jaxid.Recording.from_arrays(time, q, tau, q_ref=q_ref, gaps="allow"))
+    return found.joints.iloc[0], "\n".join(found.notes)
+
+
+@pytest.mark.parametrize(
+    ("count", "every", "law"),
+    [(1e-4, 1, "each"), (1e-4, 4, "every 4"), (None, 1, "-"), (None, 5, "every 5")],
+)
+def test_a_sampled_law_shows_in_its_torque(count, every, law):
+    time = 1e-3 * np.arange(3000)
+    q = 0.97 * np.sin(6 * time - 0.05)
+    read = q if count is None else count * np.round(q / count)
+    tau = (100 * (np.sin(6 * time) - read))[np.arange(3000) // every * every]
+    row, notes = look(read, tau)
+    assert row["law"] == law
+    assert (f"control.Sampled(every={1e-3 * every:.4g})" in notes) == (every > 1)
+    # The step of the encoder, to the digits that rounding leaves.
+    assert row["q step"] == pytest.approx(0.0 if count is None else count, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_of_its_own_is_no_sampled_law(seed):
+    rng = np.random.default_rng(seed)
+    time = 1e-3 * np.arange(3000)
+    q, tau = np.sin(6 * time), np.cos(6 * time)
+    noise = rng.normal(size=(2, 3000))
+    assert look(q + 1e-4 * noise[0], tau + 0.01 * noise[1])[0]["law"] == "-"
+
+
+def test_steps_are_found_through_the_digits_of_a_file():
+    count = 2 * np.pi / 40_000
+    time = 1e-3 * np.arange(3000)
+    # As written with eight digits: moves of up to 300 counts, each off by some 1e-4 of a count.
+    q = np.round(count * np.round(5 * np.sin(9 * time) / count), 8)
+    row, notes = look(q, np.cos(time))
+    assert row["q step"] == pytest.approx(count, rel=1e-6)
+    assert "encoder counts" in notes
+    row, notes = look(np.round(np.sin(9 * time), 5), np.cos(time))
+    assert row["q step"] == pytest.approx(1e-5, rel=1e-6)
+    assert "digits of the file" in notes
+
+
+def test_a_reference_that_repeats_or_is_held_is_told():
+    time = 1e-3 * np.arange(4000)
+    wave = np.sin(2 * np.pi * time / 0.9) + 0.3 * np.sin(4 * np.pi * time / 0.9 + 1)
+    _, notes = look(wave + 1e-3 * time, np.cos(time), q_ref=wave)
+    assert "the reference of recording repeats every 0.9 s, 4.44 times" in notes
+    _, notes = look(
+        wave + 1e-3 * time, np.cos(time), q_ref=np.sin(time**2)[np.arange(4000) // 8 * 8]
+    )
+    assert "repeats every" not in notes
+    assert "is held for 8 samples (8 ms)" in notes
+
+
+def test_gaps_are_counted():
+    time = np.delete(1e-3 * np.arange(3000), [*range(500, 700), *range(2000, 2400)])
+    _, notes = look(np.sin(time), np.cos(time), time=time)
+    assert "has 2 gaps, the longest of 0.401 s after 1.999 s" in notes
+
+
+def test_references_of_another_size_or_at_other_samples():
+    def of(name, time, size):
+        wave = size * np.sin(time**2)
+        return jaxid.Recording.from_arrays(time, wave, np.cos(time), q_ref=wave, name=name)
+
+    time = np.arange(0, 5, 0.005)
+    several = [of("a", time, 1), of("half", time, 0.5), of("late", time + 0.0021, 1)]
+    assert jaxid.inspect(several).repeats == (("a", "late"),)
+
+
 @pytest.mark.parametrize(
     ("names", "q", "tau"),
     [
@@ -65,6 +138,10 @@ def test_what_is_in_a_recording_is_what_was_put_there(tmp_path):
         ("stamp,pos_2,pos_1,effort_1,effort_2", ["pos_1", "pos_2"], ["effort_1", "effort_2"]),
         ("Time,Position[1],Position[2],Current[1],Current[2]", None, None),
         ("timestamp,angle,torque", ["angle"], ["torque"]),
+        ("robot/stamp,robot/qpos_1,robot/qpos_2,robot/effort_1,robot/effort_2", None, None),
+        ("t_ms,pos_meas1,pos_meas2,tau_con1,tau_con2,tau_fric1,tau_fric2", None, None),
+        ("dt,q,tau,G", ["q"], ["tau"]),
+        ("t,q_goal,q,dq,pwm,volts", ["q"], ["pwm"]),
         ("time,actual_q_0,actual_q_1,actual_current_0,actual_current_1", None, None),
     ],
 )

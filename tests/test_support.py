@@ -7,7 +7,7 @@ from test_noise_floor import DURATION, axis
 import jaxid
 from jaxid.control import Tracking
 from jaxid.discovery.support import _errors
-from jaxid.effects import Stribeck, ThermalDrift
+from jaxid.effects import ThermalDrift
 
 STRETCH = np.repeat(np.arange(6), 200)
 

@@ -22,6 +22,22 @@ class ReadOptions(eqx.Module):
     clock: str = "recorded"
     drop_nan: bool = False
 
+    def told(self) -> dict[str, Any]:
+        """What `jaxid.read` takes beside files: the description, and what options add to it.
+
+        **Raises:** `ModelError` for a description or an option that cannot be understood.
+        """
+        told = {} if self.log is None else described(self.log)
+        told["columns"] = told.get("columns", {}) | _several(_pairs(self.column, "column"))
+        told["units"] = told.get("units", {}) | _several(_pairs(self.unit, "unit"))
+        if self.gaps != "refuse":
+            told["gaps"] = self.gaps
+        if self.clock != "recorded":
+            told["clock"] = self.clock
+        if self.drop_nan:
+            told["nan"] = "drop"
+        return {key: value for key, value in told.items() if value != {}}
+
     def __call__(self, files: Sequence[Path]) -> Any:
         """The recordings in files.
 
@@ -29,23 +45,16 @@ class ReadOptions(eqx.Module):
         """
         from ..recording import read
 
-        told = {} if self.log is None else described(self.log)
-        columns = told.get("columns", {}) | _several(_pairs(self.column, "column"))
-        units = told.get("units", {}) | _several(_pairs(self.unit, "unit"))
-        gaps: Any = self.gaps if self.gaps != "refuse" else told.get("gaps", "refuse")
-        clock: Any = self.clock if self.clock != "recorded" else told.get("clock", "recorded")
-        nan = "drop" if self.drop_nan else told.get("nan", "refuse")
-        return read(
-            *files, columns=columns or None, units=units or None, gaps=gaps, nan=nan, clock=clock
-        )
+        return read(*files, **self.told())
 
 
 def described(path: Path) -> dict[str, Any]:
-    """What a TOML file says of logs: `[columns]`, `[units]`, and `gaps`, `nan`, `clock`.
+    """What a TOML file says of logs, by the names that `jaxid.read` gives it.
 
     **Raises:** `ModelError` for a file that says something else.
     """
-    known = {"columns": dict, "units": dict, "gaps": str, "nan": str, "clock": str}
+    known: dict[str, Any] = {"columns": dict, "units": dict, "scale": dict, "joints": list}
+    known |= {"resolution": (int, float, list), "gaps": str, "nan": str, "clock": str}
     try:
         told = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -55,8 +64,9 @@ def described(path: Path) -> dict[str, Any]:
     for key, value in told.items():
         if not isinstance(value, known.get(key, ())):
             raise ModelError(
-                f"{path} has {key!r}{near(key, known)}: give tables [columns] and [units], and "
-                'gaps = "allow", nan = "drop" or clock = "even"'
+                f"{path} has {key!r}{near(key, known)}: give tables [columns], [units] and "
+                '[scale], lists joints and resolution, and gaps = "allow", nan = "drop" or '
+                'clock = "even"'
             )
     return told
 

@@ -1,16 +1,15 @@
 """The commands `inspect` and `diagnose`."""
 
-import json
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from ..errors import RecordingError
+from .describing import description, guess, guess_units, on_torque, taken
 from .ending import sentences
-from .files import ReadOptions, check_outputs, described, write_json
+from .files import ReadOptions, check_outputs, write_json
 from .models import load_effect, load_robot, with_controller
 from .options import (
     Catalogue,
@@ -27,15 +26,6 @@ from .options import (
     Unit,
 )
 
-# What logs call the signals, numbers and underscores aside; the first that is there is meant.
-_CALLED = {
-    "time": ("time", "t", "stamp", "timestamp", "time_s", "time_ms", "sec", "ms"),
-    "q": ("q", "pos", "position", "angle", "theta", "joint_pos", "joint_position", "actual_q"),
-    "tau": ("tau", "torque", "effort", "trq", "force", "i", "current", "cur", "actual_current"),
-    "v": ("dq", "qd", "qp", "vel", "velocity", "speed", "omega", "joint_vel", "actual_qd"),
-    "q_ref": ("q_ref", "qref", "qr", "ref", "des", "q_des", "target", "target_q", "goal", "cmd"),
-}
-
 
 def inspect(
     files: Files,
@@ -48,49 +38,69 @@ def inspect(
     drop_nan: DropNan = False,
     write: Annotated[
         Path | None,
-        typer.Option(help="Write columns and units to this TOML file, to be edited: for --log."),
+        typer.Option(
+            help="Write columns, units and scales to this TOML file, to be edited: for --log."
+        ),
     ] = None,
     plot: Annotated[
         Path | None, typer.Option(help="Draw the recordings to this HTML file.")
     ] = None,
 ) -> None:
-    """Show what is in recordings: columns, rates, gaps, ranges, rests, encoder steps, repeats.
+    """Show what is in recordings: topics, columns, rates, gaps, ranges, encoder steps, the law's
+    clock, repeats.
 
     \b
     Examples:
       jaxid inspect run_1.csv run_2.csv
       jaxid inspect run_1.csv --write log.toml
-      jaxid inspect run_1.csv --log log.toml --plot run_1.html
+      jaxid inspect bag_folder --log log.toml --plot run_1.html
 
     The exit code is 0, or 2 where the files cannot be used as they are described.
     """
-    from ..recording import columns_of
+    from ..recording import contents_of
     from ..signals.inspection import inspect as look
 
     with sentences():
         check_outputs(json_file, write, plot)
         reading = ReadOptions(column, unit, log, gaps, clock, drop_nan)
-        guessed: dict[str, Any] = {}
+        found = contents_of(files[0], **_named(reading))
+        for line in found.about or (", ".join(found.columns),):
+            typer.echo(f"{files[0].name}: {line}")
         try:
             recordings = reading(files)
         except RecordingError as error:
-            names = columns_of(files[0])
-            guessed = guess(names)
+            guessed = guess(found.columns)
             if column is not None or log is not None or not guessed:
                 raise
-            typer.echo(f"columns of {files[0].name}: {', '.join(names)}")
-            typer.echo(f"not read as they are: {error}")
-            told = [f"{k}={v if isinstance(v, str) else ','.join(v)}" for k, v in guessed.items()]
-            typer.echo(f"taken for now: {'  '.join(told)}")
-            recordings = ReadOptions(told, unit, log, gaps, clock, drop_nan)(files)
-        found = look(recordings)
-        typer.echo(repr(found))
-        write_json(json_file, found.to_dict())
+            typer.echo(f"not read as it is: {error}")
+            units = (unit or []) + _pairs(guess_units(guessed, unit or []))
+            reading = ReadOptions(_pairs(guessed), units, log, gaps, clock, drop_nan)
+            typer.echo(f"taken for now: {'  '.join(_pairs(guessed) + units)}")
+            recordings = reading(files)
+            found = contents_of(files[0], **_named(reading))
+        if found.joints:
+            typer.echo(taken(found))
+        inspected = look(recordings)
+        typer.echo(repr(inspected))
+        if remark := on_torque(found.signals.get("tau", [])):
+            typer.echo(remark)
+        write_json(json_file, inspected.to_dict())
         if write is not None:
-            write.write_text(description(reading, guessed, recordings.joints), encoding="utf-8")
+            text = description(reading.told(), found, recordings.joints)
+            write.write_text(text, encoding="utf-8")
             typer.echo(f"{write} describes these files: check it, then use --log {write}")
         if plot is not None:
             plot.write_text(_drawn(recordings), encoding="utf-8")
+
+
+def _named(reading: ReadOptions) -> dict[str, Any]:
+    """What the options say of columns and joints."""
+    return {key: value for key, value in reading.told().items() if key in ("columns", "joints")}
+
+
+def _pairs(named: Mapping[str, Any]) -> list[str]:
+    """As options on the command line."""
+    return [f"{k}={v if isinstance(v, str) else ','.join(v)}" for k, v in named.items()]
 
 
 def _drawn(recordings: Any) -> str:
@@ -110,50 +120,6 @@ def _drawn(recordings: Any) -> str:
         figure = signals(r.time, panels, titles=titles, title=r.name)
         parts.append(figure.to_html(full_html=False, include_plotlyjs=k == 0))
     return f"<!doctype html><meta charset=utf-8><title>recordings</title>{''.join(parts)}"
-
-
-def guess(names: Sequence[str]) -> dict[str, Any]:
-    """Which columns a log's names may mean; empty where a signal that is needed is not found."""
-    stems: dict[str, list[tuple[int, str]]] = {}
-    for name in names:
-        match = re.fullmatch(r"(.*?)[_.\[ ]*(\d*)\]?", name.strip().lower())
-        assert match is not None
-        stems.setdefault(match[1], []).append((int(match[2] or 0), name))
-    found: dict[str, Any] = {}
-    for signal, words in _CALLED.items():
-        word = next((w for w in words if w in stems), None)
-        if word is not None:
-            numbered = [name for _, name in sorted(stems.pop(word))]
-            found[signal] = numbered[0] if signal == "time" else numbered
-    joints = len(found.get("q", ()))
-    if "time" not in found or not joints or len(found.get("tau", ())) != joints:
-        return {}
-    return {k: v for k, v in found.items() if k == "time" or len(v) == joints}
-
-
-def description(reading: ReadOptions, guessed: dict[str, Any], joints: int) -> str:
-    """A TOML file that says how these files are read, with what else may be said in it."""
-    told = {} if reading.log is None else described(reading.log)
-    columns = told.get("columns", {}) | guessed
-    if not columns:
-        columns = {"time": "time"} | {
-            signal: [f"{signal}_{j}" for j in range(1, joints + 1)] for signal in ("q", "tau")
-        }
-    units = {"time": "s", "q": ["rad"] * joints, "tau": ["Nm"] * joints} | told.get("units", {})
-    lines = [
-        "# How jaxid reads these logs: jaxid discover FILES --log THIS.toml",
-        "# Torque of the joint's side of the gear; current times torque constant times gear ratio",
-        '# is "current_1*0.062*100".',
-        f"gaps = {json.dumps(reading.gaps)}  # or refuse: missing stretches of time",
-        f"clock = {json.dumps(reading.clock)}  # or even: where a logger's times jitter",
-        "",
-        "[columns]",
-        *(f"{name} = {json.dumps(value)}" for name, value in columns.items()),
-        "",
-        "[units]  # rad, deg, turn, m, mm; Nm, mNm, N; s, ms, us",
-        *(f"{name} = {json.dumps(value)}" for name, value in units.items()),
-    ]
-    return "\n".join(lines) + "\n"
 
 
 def diagnose(

@@ -7,7 +7,10 @@ import typer
 
 Files = Annotated[
     list[Path],
-    typer.Argument(help="Recordings: .csv, .tsv, .txt, .parquet, .mat or .npz, also .gz."),
+    typer.Argument(
+        help="Recordings: .csv, .tsv, .txt (also .gz), .parquet, .mat, .npz, .h5, a bag of ROS 2, "
+        "or a LeRobot dataset (FOLDER/episode_3 for one episode)."
+    ),
 ]
 Robot = Annotated[
     str | None,
@@ -28,7 +31,9 @@ Unit = Annotated[
 ]
 Log = Annotated[
     Path | None,
-    typer.Option("--log", help="Columns and units in a TOML file, as jaxid inspect --write does."),
+    typer.Option(
+        "--log", help="Columns, units, scales in a TOML file, as of jaxid inspect --write."
+    ),
 ]
 Gaps = Annotated[
     Literal["refuse", "allow"], typer.Option(help="Missing stretches of time in a recording.")

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..recording import Recording, Recordings
-from ..signals.inspection import repeated
+from ..signals.inspection import repeats_of
 from ..signals.smoothing import low_pass
 
 Source = Literal["repeats", "above the motion"]
@@ -106,9 +106,12 @@ def from_repeats(recordings: Recordings, compared: Compared) -> dict[str, tuple[
     """
     named = {r.name: r for r in recordings}
     found: dict[str, tuple[Level, ...]] = {}
-    for one, other in repeated(recordings):
+    for one, other in repeats_of(recordings):
         length = min(named[one].samples, named[other].samples)
         pair = [_first(named[name], length) for name in (one, other)]
+        # The same reference at other times of the clock is no sample for sample repeat.
+        if not np.allclose(*(r.time - r.time[0] for r in pair), rtol=0, atol=0.1 * pair[0].period):
+            continue
         apart = []
         for both in zip(*((r.tau, *_motion(r)) for r in pair), strict=True):
             mine, its = compared(pair, both)

@@ -69,6 +69,8 @@ def numeric(
         if isinstance(values, pd.Series) and values.dtype.kind in "iuf":
             values = values.to_numpy(np.float64, na_value=np.nan)
         array = np.asarray(values)
+        if array.dtype.kind == "O" and array.ndim == 1 and _are_lists(array):
+            array = np.stack([np.asarray(cell) for cell in array])
         if array.dtype.kind in "iuf":
             with np.errstate(over="ignore"):
                 return array.astype(np.float64)
@@ -79,6 +81,11 @@ def numeric(
             "give one number for each sample and joint",
         ) from error
     raise _not_numeric(source, column, array, lines)
+
+
+def _are_lists(array: np.ndarray) -> bool:
+    """Whether the cells of a column are lists, of one value for each joint."""
+    return len(array) > 0 and all(isinstance(cell, list | tuple | np.ndarray) for cell in array)
 
 
 def _not_numeric(source: str, column: str, array: np.ndarray, lines: Lines) -> Exception:
@@ -123,6 +130,7 @@ def validate(
     signals: Mapping[str, Float64[np.ndarray, "..."]],
     labels: Labels,
     units: Units | None,
+    scale: Mapping[str, float | int | Sequence[float]] | None,
     accept: "Accept",
     lines: Lines = (),
 ) -> dict[str, Float64[np.ndarray, "..."]]:
@@ -133,7 +141,7 @@ def validate(
     - `source`: the file or recording they come from.
     - `signals`: values by signal, in the units of the file; 1-d means one joint.
     - `labels`: what the file calls the columns of each signal.
-    - `units`: unit by signal.
+    - `units`, `scale`: unit and factor by signal.
     - `accept`: what of the file's faults to put up with.
     - `lines`: of the rows in a text file.
 
@@ -141,7 +149,7 @@ def validate(
 
     **Raises:** `RecordingError` for the first thing that is wrong.
     """
-    scale = factors(source, units)
+    by_signal = factors(source, units, scale)
     shaped = _shapes(source, signals, labels)
     if len(shaped["time"]) < _FEWEST_SAMPLES:
         raise problem(
@@ -154,14 +162,17 @@ def validate(
     checked = {}
     for signal, values in shaped.items():
         joints = values.shape[1] if values.ndim == 2 else 1
-        if len(scale[signal]) not in (1, joints):
+        factor = by_signal[signal]
+        if len(factor) not in (1, joints):
+            what = "units" if np.size((units or {}).get(signal, "")) > 1 else "scale"
             raise problem(
                 source,
-                f"units gives {len(scale[signal])} units for {signal} of {joints} joints",
-                "give one unit, or one for each joint",
+                f"{what} gives {len(factor)} {what.replace('scale', 'factors')} for {signal} of "
+                f"{joints} joints",
+                "give one, or one for each joint",
             )
         with np.errstate(over="ignore"):
-            checked[signal] = values * scale[signal]
+            checked[signal] = values * factor
         _finite(source, signal, checked[signal], labels, lines)
         _bounded(source, signal, checked[signal], labels, lines)
     if accept.clock == "even":

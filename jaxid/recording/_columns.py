@@ -3,8 +3,7 @@
 import contextlib
 import itertools
 import re
-from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -12,25 +11,12 @@ from jaxtyping import Float64
 
 from ..errors import brief, near
 from ._checks import numeric
+from ._description import Columns, Description
+from ._joints import by_joint
 from ._problem import problem
+from ._streams import aligned
+from ._table import Table
 from ._units import SIGNALS
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-Columns = Mapping[str, str | Sequence[str]]
-
-
-class Table(eqx.Module):
-    """Named columns of one file, not yet looked at.
-
-    `refused` names what the file also holds but cannot be a column, and says what it is. `lines`
-    are the rows' lines in a text file.
-    """
-
-    columns: dict[str, object]
-    refused: dict[str, str] = eqx.field(default_factory=dict)
-    lines: tuple[int, ...] = ()
 
 
 class Layout(eqx.Module):
@@ -78,74 +64,56 @@ class Picked(eqx.Module):
     lines: tuple[int, ...] = ()
 
 
-def pick(source: str, table: Table, columns: Columns | None) -> Picked:
+def pick(source: str, table: Table, told: Description) -> Picked:
     """Finds the signals in a table.
 
     **Arguments:**
 
     - `source`: the file or recording it comes from.
     - `table`: its columns.
-    - `columns`: our names to theirs; where silent, default names and known layouts hold.
+    - `told`: our names to theirs; where silent, default names and known layouts hold.
 
     **Raises:** `RecordingError` for a column that is missing, doubled or not numeric.
+    """
+    labels, quantised = labels_of(source, table, told)
+    columns = aligned(source, table.columns, labels)
+    there = eqx.tree_at(lambda t: t.columns, table, columns)
+    signals = {signal: _stack(source, there, signal, names) for signal, names in labels.items()}
+    if "time" in (told.columns or {}) and signals["time"].size == 1 < len(signals["q"]):
+        signals["time"] = _counted(source, signals["time"], len(signals["q"]), labels["time"][0])
+    return Picked(signals, labels, quantised, table.lines)
+
+
+def labels_of(source: str, table: Table, told: Description) -> tuple[dict[str, list[str]], bool]:
+    """Columns by signal, and whether positions are whole encoder counts where they look like it.
+
+    **Raises:** `RecordingError` for a signal that is not found.
     """
     layouts = ((layout, layout.columns(table.columns)) for layout in known_layouts())
     known = next(((layout, names) for layout, names in layouts if names is not None), None)
     # A mapping or a `time` column says that the file is not meant in the way of a known layout.
-    if columns is not None or "time" in table.columns:
+    if told.columns is not None or "time" in table.columns:
         known = None
-    labels = _resolve(source, table, known[1] if known else columns)
-    signals = {signal: _stack(source, table, signal, names) for signal, names in labels.items()}
-    return Picked(signals, labels, known is not None and known[0].quantised, table.lines)
+    named = by_joint(source, table, told)
+    labels = _resolve(source, table, known[1] if known else told.columns, named)
+    return labels, known is not None and known[0].quantised
 
 
-def from_frame(source: str, frame: "pd.DataFrame", lines: tuple[int, ...] = ()) -> Table:
-    """The columns of a DataFrame, each named once."""
-    names = [str(name).strip() for name in frame.columns]
-    unique(source, names)
-    return Table({name: frame.iloc[:, i] for i, name in enumerate(names)}, {}, lines)
+def _counted(
+    source: str, period: Float64[np.ndarray, "..."], samples: int, name: str
+) -> Float64[np.ndarray, " samples"]:
+    """Times from a period, where a file has no column of them."""
+    every = float(period.reshape(()))
+    if not 0 < every < np.inf:
+        raise problem(
+            source, f"{name} is a period of {every:.6g}", "give the time between two samples, s"
+        )
+    return every * np.arange(samples)
 
 
-def unique(source: str, names: Sequence[str]) -> None:
-    """Raises `RecordingError` when a name that is not empty appears twice."""
-    seen = set()
-    for name in filter(None, names):
-        if name in seen:
-            raise problem(
-                source, f"column {brief(name)} appears more than once", "rename or remove one"
-            )
-        seen.add(name)
-
-
-def quantum(q: Float64[np.ndarray, "samples joints"]) -> Float64[np.ndarray, " joints"] | None:
-    """The step that all positions are whole multiples of, or None when there is none.
-
-    **Arguments:**
-
-    - `q`: positions, `(samples, joints)`, rad or m.
-    """
-    steps = [_step(column) for column in q.T]
-    return None if None in steps else np.array(steps, dtype=np.float64)
-
-
-def _step(q: Float64[np.ndarray, " samples"]) -> float | None:
-    with np.errstate(all="ignore"):
-        moves = np.abs(np.diff(q))
-        moves = moves[moves > 1e-12 * np.abs(q).max(initial=0.0)]
-        if moves.size < 20:
-            return None
-        counts = moves / moves.min()
-        # A hundredth of a count is far above rounding, and 20 moves that all meet it by chance
-        # have odds of 1 to 50**20.
-        if not (np.abs(counts - np.round(counts)) < 0.01).all():
-            return None
-        step = float(np.median(moves / np.round(counts)))
-        decade = np.log10(step)
-    # A power of ten is where the file's decimals end, not the encoder's counts.
-    return None if abs(decade - np.round(decade)) < 1e-6 else step
-
-
-def _resolve(source: str, table: Table, columns: Columns | None) -> dict[str, list[str]]:
+def _resolve(
+    source: str, table: Table, columns: Columns | None, named: dict[str, list[str]]
+) -> dict[str, list[str]]:
     labels = {}
     for signal, names in (columns or {}).items():
         if signal not in SIGNALS:
@@ -159,7 +127,8 @@ def _resolve(source: str, table: Table, columns: Columns | None) -> dict[str, li
             raise problem(source, f"columns gives no column for {signal}", "name one, or omit it")
     for signal in SIGNALS:
         if signal not in labels:
-            found = [signal] if signal == "time" else _default_names(source, table, signal)
+            found = [signal] if signal == "time" else named.get(signal, [])
+            found = found or _default_names(source, table, signal)
             if found:
                 labels[signal] = found
     _same_count(source, table, labels, columns or {})
@@ -207,6 +176,8 @@ def _same_count(source: str, table: Table, labels: dict[str, list[str]], given: 
 def _stack(
     source: str, table: Table, signal: str, names: Sequence[str]
 ) -> Float64[np.ndarray, "..."]:
+    if signal == "time":
+        return _factor(source, table, signal, names[0])
     columns = [_column(source, table, signal, name) for name in names]
     if len(columns) == 1:
         return columns[0]
@@ -222,8 +193,10 @@ def _stack(
 
 
 def _column(source: str, table: Table, signal: str, name: str) -> Float64[np.ndarray, "..."]:
-    if name in table.columns:
-        return numeric(source, name, table.columns[name], table.lines)
+    # A path in HDF5 may begin at the root.
+    for there in (name, name.removeprefix("/")):
+        if there in table.columns:
+            return numeric(source, name, table.columns[there], table.lines)
     if "*" not in name or name in table.refused:
         raise missing(source, table, signal, name)
     factors = [_factor(source, table, signal, factor.strip()) for factor in name.split("*")]
@@ -248,6 +221,21 @@ def _factor(source: str, table: Table, signal: str, name: str) -> Float64[np.nda
 
 def missing(source: str, table: Table, signal: str, name: str, beside: str = "") -> Exception:
     """The error for a column of a signal that is not there, or not of a kind that can be read."""
+    if signal in table.unclear:
+        return problem(
+            source,
+            f"it is not clear which columns are {signal}: {table.unclear[signal]}",
+            f"say which: columns={{'{signal}': ...}}, --column {signal}=...",
+        )
+    if table.defaults and signal not in table.defaults and name == f"{signal}_1":
+        what = {"q": "positions", "tau": "torques (effort)"}.get(signal, signal)
+        beside = {of: ", ".join(joints) for of, joints in table.defaults.items()}
+        return problem(
+            source,
+            f"no column has {what} of joints, there are {beside}",
+            f"record them, or say which they are: columns={{'{signal}': ...}}, --column "
+            f"{signal}=... (jaxid.recording.contents_of lists what there is)",
+        )
     if name in table.refused:
         return problem(
             source,

@@ -1,50 +1,82 @@
 """From files to recordings."""
 
+import contextlib
 import csv
 import gzip
 import io
 import itertools
 import os
-import zipfile
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 
 from ..errors import JaxidError, RecordingError, brief, require
-from ..storage.arrays import npy
+from ._bag import bag_name, bag_table, is_bag
 from ._checks import Accept, Clock, Gaps, Nan, is_number
-from ._columns import Columns, Table, from_frame, pick, unique
+from ._columns import labels_of, pick
+from ._description import Columns, Description, Resolution, Scale
+from ._hdf5 import hdf5_table
+from ._lerobot import episodes, lerobot_folder
 from ._matlab import order_of, variables
+from ._numpy import npz_table
 from ._problem import problem
-from ._recording import Recording, Recordings, build
+from ._recording import Recordings, build
+from ._table import Table, from_frame, unique
 from ._units import Units
 
 # Two million samples of seven columns as text; a laptop holds what reading them takes.
 LARGEST = 256 * 2**20
 
 
+class Contents(eqx.Module):
+    """What `contents_of` found in a file.
+
+    - `columns`: names of its columns, arrays or streams.
+    - `signals`: columns by signal, as `jaxid.read` takes them; empty where it cannot.
+    - `joints`: names of joints, where columns carry them.
+    - `about`: what else there is, a line each: topics of a bag, features of a dataset.
+    """
+
+    columns: tuple[str, ...]
+    signals: dict[str, list[str]]
+    joints: tuple[str, ...] = ()
+    about: tuple[str, ...] = ()
+
+
 def read(
     *paths: str | os.PathLike[str],
     columns: Columns | None = None,
+    joints: Sequence[str] | None = None,
     units: Units | None = None,
-    resolution: float | int | Sequence[float] | None = None,
+    scale: Scale | None = None,
+    resolution: Resolution | None = None,
     gaps: Gaps = "refuse",
     nan: Nan = "refuse",
     clock: Clock = "recorded",
     largest: int = LARGEST,
 ) -> Recordings:
-    """Reads recordings from `.csv`, `.tsv`, `.txt` (or these `.gz`), `.parquet`, `.mat`, `.npz`.
+    """Reads recordings from text, Parquet, MATLAB, NumPy, HDF5, bags of ROS 2 and LeRobot datasets.
 
     **Arguments:**
 
-    - `paths`: one file for each recording, which takes the file's name.
+    - `paths`: one for each recording, which takes its name: `.csv`, `.tsv`, `.txt` (or these
+      `.gz`), `.parquet`, `.mat`, `.npz`, `.h5`, `.hdf5`, a bag (its folder, `.mcap` or `.db3`); or
+      the folder of a LeRobot dataset for all of its episodes, `FOLDER/episode_3` for one.
     - `columns`: our names to the file's, e.g. `{"time": "t", "q": ["pos1", "pos2"]}`; a name may
-      be a product, `"gain*current"`. Where silent: `time`, `q_1..n`, `tau_1..n` and, if there,
-      `q_ref_1..n`, `v_1..n`, `tau_ff_1..n`; also `q`, `tau`, ... for all joints at once. Files of
-      the EMPS benchmark are recognised. Other columns are ignored.
+      be a product, `"gain*current"`, and `time` the period, as a number or the name of one. Where
+      silent: `time`, `q_1..n`, `tau_1..n` and, if there, `q_ref_1..n`, `v_1..n`, `tau_ff_1..n`;
+      also `q`, `tau`, ... for all joints at once. Files of the EMPS benchmark are recognised, and
+      joint states of bags and datasets. Other columns are ignored.
+    - `joints`: names of joints in the order of the robot, where a bag or dataset has them; all of
+      them by name where silent.
     - `units`: unit by signal, e.g. `{"q": "deg", "v": "deg/s", "tau": "N·mm", "time": "ms"}`; SI
       where silent, `q_ref` as `q`, `tau_ff` as `tau`.
+    - `scale`: factor by signal, one or one for each joint, e.g. `{"tau": [0.062 * 100, 0.05 * 50]}`
+      for amperes, by torque constant and gear ratio, or `{"q": 2 * np.pi / 4096}` for counts;
+      `q_ref` as `q`, `tau_ff` as `tau`.
     - `resolution`: encoder step, one or one for each joint, rad or m.
     - `gaps`: `"allow"` to accept missing stretches of time.
     - `nan`: `"drop"` to leave out samples at which a signal is empty; a warning counts them.
@@ -57,51 +89,86 @@ def read(
     """
     if not paths:
         raise problem("read()", "no file was given", "pass at least one path")
-    accept = Accept(gaps, nan, clock)
+    told = Description(columns, joints, units, scale, resolution, Accept(gaps, nan, clock))
     return Recordings.of(
-        _read_one(Path(path), columns, units, resolution, accept, largest) for path in paths
+        build(source, name, pick(source, table, told), told)
+        for path in paths
+        for source, name, table in _tables(Path(path), largest)
     )
 
 
-def columns_of(path: str | os.PathLike[str], *, largest: int = LARGEST) -> tuple[str, ...]:
-    """Names of the columns, or arrays, that a file has.
+def contents_of(
+    path: str | os.PathLike[str],
+    *,
+    columns: Columns | None = None,
+    joints: Sequence[str] | None = None,
+    largest: int = LARGEST,
+) -> Contents:
+    """What a file holds: of a dataset, its first episode.
+
+    **Arguments:**
+
+    - `path`, `columns`, `joints`, `largest`: as in `jaxid.read`.
 
     **Raises:** `RecordingError` for a file that cannot be read.
     """
-    return tuple(_table(Path(path), largest).columns)
-
-
-def _read_one(
-    path: Path,
-    columns: Columns | None,
-    units: Units | None,
-    resolution: float | int | Sequence[float] | None,
-    accept: Accept,
-    largest: int,
-) -> Recording:
-    inner = path.with_suffix("") if path.suffix.lower() == ".gz" else path
-    picked = pick(str(path), _table(path, largest), columns)
-    return build(str(path), inner.stem, picked, units, resolution, accept)
-
-
-def _table(path: Path, largest: int) -> Table:
-    source = str(path)
-    zipped = path.suffix.lower() == ".gz"
-    inner = path.with_suffix("") if zipped else path
-    data = _bytes(source, path, largest)
-    reader = _reader(source, inner.suffix.lower(), zipped)
+    source, _, table = next(iter(_tables(Path(path), largest)))
     try:
-        data = _gunzip(source, data, largest) if zipped else data
-        return reader(source, data, largest)
-    except JaxidError:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            labels, _ = labels_of(source, table, Description(columns, joints))
+    except RecordingError:
+        labels = {}
+    known = dict.fromkeys(j for by_joint in table.defaults.values() for j in by_joint)
+    return Contents(tuple(table.columns), labels, tuple(known), table.about)
+
+
+def _tables(path: Path, largest: int) -> Iterator[tuple[str, str, Table]]:
+    """What messages call it, its name, and the table of each recording that a path holds."""
+    source = str(path)
+
+    def refuse(size: int) -> Exception:
+        return _too_large(source, size, largest)
+
+    with _said(source, path):
+        dataset = lerobot_folder(path)
+        if dataset is not None:
+            for name, table in episodes(source, *dataset, largest, refuse):
+                yield str(dataset[0] / name), name, table
+        elif is_bag(path):
+            if path.is_file():
+                _there(source, path)
+            yield source, bag_name(path), bag_table(source, path, largest, refuse)
+        elif path.suffix.lower() in (".h5", ".hdf5"):
+            _there(source, path)
+            yield source, path.stem, hdf5_table(path, largest, refuse)
+        else:
+            inner = path.with_suffix("") if path.suffix.lower() == ".gz" else path
+            yield source, inner.stem, _table(source, path, inner, largest)
+
+
+@contextlib.contextmanager
+def _said(source: str, path: Path) -> Iterator[None]:
+    """Turns what parsers raise into a sentence."""
+    try:
+        yield
+    except (JaxidError, GeneratorExit):
         raise
     except Exception as error:  # parsers of broken files raise nearly anything
+        kind = "".join(path.suffixes[-1 - (path.suffix.lower() == ".gz") :]) or "a folder of logs"
         raise problem(
             source,
-            f"cannot be read as {inner.suffix}{path.suffix * zipped}, it is damaged, cut off or of "
-            f"another kind ({type(error).__name__}: {error})",
+            f"cannot be read as {kind}, it is damaged, cut off or of another kind "
+            f"({type(error).__name__}: {error})",
             "write or copy the file again",
         ) from error
+
+
+def _table(source: str, path: Path, inner: Path, largest: int) -> Table:
+    zipped = inner != path
+    data = _bytes(source, path, largest)
+    reader = _reader(source, inner.suffix.lower(), zipped)
+    return reader(source, _gunzip(source, data, largest) if zipped else data, largest)
 
 
 def _reader(source: str, extension: str, zipped: bool) -> Callable[[str, bytes, int], Table]:
@@ -113,38 +180,55 @@ def _reader(source: str, extension: str, zipped: bool) -> Callable[[str, bytes, 
         case ".mat" if not zipped:
             return _mat
         case ".npz" if not zipped:
-            return _npz
+            return lambda source, data, largest: npz_table(
+                source, data, largest, lambda size: _too_large(source, size, largest)
+            )
+    if extension == ".bag":
+        raise problem(source, "is a bag of ROS 1", "convert it with rosbags-convert of rosbags")
     raise problem(
         source,
         f"the extension {brief(Path(source).suffix)} is not known",
-        "use .csv, .tsv or .txt (or these with .gz), .parquet, .mat or .npz",
+        "use .csv, .tsv or .txt (or these with .gz), .parquet, .mat, .npz, .h5, .mcap or .db3",
     )
 
 
 def _bytes(source: str, path: Path, largest: int) -> bytes:
+    size = _there(source, path)
+    if size > largest:
+        raise _too_large(source, size, largest)
+    with open(path, "rb") as file:
+        data = file.read(largest + 1)
+    if len(data) > largest:
+        raise _too_large(source, len(data), largest)
+    return data
+
+
+def _there(source: str, path: Path) -> int:
+    """Size of a plain file that can be opened, in bytes."""
     try:
         # A pipe or a device would be read for ever.
         if path.exists() and not path.is_file() and not path.is_dir():
             raise problem(source, "is no plain file", "copy its content to a file")
-        if path.is_file() and path.stat().st_size > largest:
-            raise _too_large(source, path.stat().st_size, largest)
         with open(path, "rb") as file:
-            data = file.read(largest + 1)
+            size = os.fstat(file.fileno()).st_size
     except FileNotFoundError as error:
         raise problem(source, "there is no such file", "check the path") from error
     except IsADirectoryError as error:
-        raise problem(source, "is a directory", "name the files in it") from error
+        raise problem(
+            source,
+            "is a directory, and neither a bag (no metadata.yaml) nor a LeRobot dataset (no "
+            "meta/info.json)",
+            "name the files in it",
+        ) from error
     except RecordingError:
         raise
     except (OSError, ValueError, MemoryError) as error:
         raise problem(
             source, f"cannot be opened ({error})", "check the path and permissions"
         ) from error
-    if not data:
+    if not size:
         raise problem(source, "the file is empty", "record or copy it again")
-    if len(data) > largest:
-        raise _too_large(source, len(data), largest)
-    return data
+    return size
 
 
 def _too_large(source: str, size: int, largest: int) -> RecordingError:
@@ -286,36 +370,3 @@ def _version_4(data: bytes) -> list[tuple[str, np.ndarray | str]]:
     # An empty list of names would mean all of them.
     loaded = scipy.io.loadmat(io.BytesIO(data), variable_names=names) if names else {}
     return [(name, "sparse" if kind == "sparse" else loaded[name]) for name, _, kind in listed]
-
-
-def _npz(source: str, data: bytes, largest: int) -> Table:
-    if data.startswith(np.lib.format.MAGIC_PREFIX):
-        npy(data)
-        raise problem(
-            source, "holds one bare array", "save named arrays with np.savez(file, time=..., q=...)"
-        )
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        entries = archive.infolist()
-        size = sum(entry.file_size for entry in entries)
-        if size > largest:
-            raise _too_large(source, size, largest)
-        names = [entry.filename.removesuffix(".npy") for entry in entries]
-        unique(source, names)
-        columns, refused = {}, {}
-        for name, entry in zip(names, entries, strict=True):
-            if name == entry.filename:
-                refused[name] = "file of another kind"
-            else:
-                columns[name] = _array(source, name, archive.read(entry))
-    return Table(columns, refused)
-
-
-def _array(source: str, name: str, content: bytes) -> np.ndarray:
-    try:
-        return npy(content)
-    except ValueError as error:
-        raise problem(
-            source,
-            f"array {brief(name)} cannot be read ({error})",
-            "save plain arrays of numbers with np.savez, no Python objects",
-        ) from error

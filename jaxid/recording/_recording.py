@@ -3,7 +3,7 @@
 import html
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import equinox as eqx
 import numpy as np
@@ -11,8 +11,12 @@ from jaxtyping import Float64
 
 from ..errors import brief, near
 from ._checks import Accept, Clock, Gaps, Nan, numeric, validate
-from ._columns import Columns, Picked, from_frame, pick, quantum
+from ._columns import Picked, pick
+from ._description import Columns, Description, Resolution, Scale
 from ._problem import problem
+from ._steps import quantum
+from ._table import from_frame
+from ._tables import frame_of
 from ._units import SIGNALS, Units
 
 if TYPE_CHECKING:
@@ -22,7 +26,7 @@ if TYPE_CHECKING:
 class Recording(eqx.Module):
     """Sampled signals of one experiment, in NumPy arrays of float64 and SI units.
 
-    Made by `jaxid.read`, `Recording.from_arrays` or `Recording.from_dataframe`, which check it.
+    Made by `jaxid.read`, `Recording.from_arrays` or `Recording.from_table`, which check it.
 
     **Fields:**
 
@@ -56,9 +60,10 @@ class Recording(eqx.Module):
         q_ref: object = None,
         v: object = None,
         tau_ff: object = None,
-        resolution: float | int | Sequence[float] | np.ndarray | None = None,
+        resolution: Resolution | None = None,
         name: str = "recording",
         units: Units | None = None,
+        scale: Scale | None = None,
         gaps: Gaps = "refuse",
         nan: Nan = "refuse",
         clock: Clock = "recorded",
@@ -72,7 +77,7 @@ class Recording(eqx.Module):
           rad or m, N·m or N.
         - `resolution`: encoder step, one or one for each joint, rad or m.
         - `name`: how tables and figures call it.
-        - `units`: unit by signal where it is not SI, as in `jaxid.read`.
+        - `units`, `scale`: unit and factor by signal where it is not SI, as in `jaxid.read`.
         - `gaps`, `nan`, `clock`: as in `jaxid.read`.
 
         **Raises:** `RecordingError` for whatever makes them unusable.
@@ -83,38 +88,53 @@ class Recording(eqx.Module):
             for signal, values in given.items()
             if values is not None or signal in ("time", "q", "tau")
         }
-        labels = {"time": ["time"]}
-        return build(
-            name, name, Picked(signals, labels), units, resolution, Accept(gaps, nan, clock)
+        told = Description(
+            units=units, scale=scale, resolution=resolution, accept=Accept(gaps, nan, clock)
         )
+        return build(name, name, Picked(signals, {"time": ["time"]}), told)
 
     @classmethod
-    def from_dataframe(
+    def from_table(
         cls,
-        frame: "pd.DataFrame",
+        table: object,
         *,
         columns: Columns | None = None,
         name: str | None = None,
         units: Units | None = None,
-        resolution: float | int | Sequence[float] | np.ndarray | None = None,
+        scale: Scale | None = None,
+        resolution: Resolution | None = None,
         gaps: Gaps = "refuse",
         nan: Nan = "refuse",
         clock: Clock = "recorded",
     ) -> "Recording":
-        """A recording from a DataFrame, checked.
+        """A recording from a table in memory, checked.
 
         **Arguments:**
 
-        - `frame`: one row for each sample, columns as in `jaxid.read`.
-        - `columns`, `units`, `gaps`, `nan`, `clock`: as in `jaxid.read`.
+        - `table`: one row for each sample, columns as in `jaxid.read`: a pandas DataFrame, an Arrow
+          table, or another that Arrow can take (Polars, DuckDB). A column may hold lists, of one
+          number for each joint.
+        - `columns`, `units`, `scale`, `gaps`, `nan`, `clock`: as in `jaxid.read`.
         - `name`, `resolution`: as in `from_arrays`; where None, what `to_dataframe` noted.
 
         **Raises:** `RecordingError` for whatever makes it unusable.
         """
+        frame = frame_of(str(name or "recording"), table)
         name = str(name or frame.attrs.get("name") or "recording")
         resolution = frame.attrs.get("resolution") if resolution is None else resolution
-        picked = pick(name, from_frame(name, frame), columns)
-        return build(name, name, picked, units, resolution, Accept(gaps, nan, clock))
+        told = Description(
+            columns=columns,
+            units=units,
+            scale=scale,
+            resolution=resolution,
+            accept=Accept(gaps, nan, clock),
+        )
+        return build(name, name, pick(name, from_frame(name, frame), told), told)
+
+    @classmethod
+    def from_dataframe(cls, frame: "pd.DataFrame", **options: Any) -> "Recording":
+        """A recording from a pandas DataFrame; options as of `from_table`, which takes it too."""
+        return cls.from_table(frame, **options)
 
     @property
     def samples(self) -> int:
@@ -162,7 +182,7 @@ class Recording(eqx.Module):
         return Recording(**cut, resolution=self.resolution, name=self.name)
 
     def to_dataframe(self) -> "pd.DataFrame":
-        """One row for each sample; `from_dataframe` gives the same recording back."""
+        """One row for each sample; `from_table` gives the same recording back."""
         import pandas as pd
 
         columns = {}
@@ -282,14 +302,7 @@ class Recordings(eqx.Module):
         return f"<ol>{items}</ol>"
 
 
-def build(
-    source: str,
-    name: str,
-    picked: Picked,
-    units: Units | None,
-    resolution: float | int | Sequence[float] | np.ndarray | None,
-    accept: Accept,
-) -> Recording:
+def build(source: str, name: str, picked: Picked, told: Description) -> Recording:
     """A recording of signals that were found, once they pass all checks.
 
     **Arguments:**
@@ -297,20 +310,21 @@ def build(
     - `source`: what messages call it, e.g. its path.
     - `name`: the recording's name.
     - `picked`: the signals, in the units of the file.
-    - `units`, `resolution`: as in `jaxid.read`.
-    - `accept`: what of their faults to put up with.
+    - `told`: their units, and what of their faults to put up with.
 
     **Raises:** `RecordingError` for whatever makes them unusable.
     """
-    signals = validate(source, picked.signals, picked.labels, units, accept, picked.lines)
+    signals = validate(
+        source, picked.signals, picked.labels, told.units, told.scale, told.accept, picked.lines
+    )
     joints = signals["q"].shape[1]
     step = quantum(signals["q"]) if picked.quantised else None
-    if resolution is not None:
-        step = numeric(source, "resolution", resolution)
+    if told.resolution is not None:
+        step = numeric(source, "resolution", told.resolution)
         if step.shape not in ((), (1,), (joints,)) or not np.all((step > 0) & np.isfinite(step)):
             raise problem(
                 source,
-                f"resolution is {brief(resolution)}",
+                f"resolution is {brief(told.resolution)}",
                 f"give one positive step, or {joints}, in rad or m",
             )
         step = np.broadcast_to(step, (joints,)).copy()

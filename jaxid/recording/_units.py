@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from ..errors import near
+from ..errors import brief, near
 from ._problem import problem
 
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
@@ -37,30 +38,66 @@ _SAME_UNIT_AS = {"q_ref": "q", "tau_ff": "tau"}
 Units = Mapping[str, str | Sequence[str]]
 
 
-def factors(source: str, units: Units | None) -> dict[str, Float64[np.ndarray, " units"]]:
+def factors(
+    source: str, units: Units | None, scale: Mapping[str, float | int | Sequence[float]] | None
+) -> dict[str, Float64[np.ndarray, " factors"]]:
     """What to multiply each signal with to get SI.
 
     **Arguments:**
 
     - `source`: the file or recording the units are for.
     - `units`: unit by signal, one for all joints or one for each.
+    - `scale`: factor by signal, one for all joints or one for each.
 
     **Returns:** factors by signal; one, or one for each joint.
 
-    **Raises:** `RecordingError` for a signal or a unit that is not known.
+    **Raises:** `RecordingError` for a signal or a unit that is not known, and for a factor that is
+        nil or no number.
     """
-    given = dict(units or {})
-    for signal in given:
+    in_units, scaled = _completed(source, "units", units), _completed(source, "scale", scale)
+    found = {}
+    for signal in SIGNALS:
+        unit = _factor(source, signal, in_units.get(signal))
+        times = _scale(source, signal, scaled.get(signal, 1.0))
+        if len(unit) > 1 < len(times) and len(unit) != len(times):
+            raise problem(
+                source,
+                f"units gives {len(unit)} units for {signal} and scale {len(times)} factors",
+                "give one for all joints, or one for each",
+            )
+        found[signal] = unit * times
+    return found
+
+
+def _completed(source: str, what: str, given: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What is given by signal, and for signals that share the unit of another."""
+    whole = dict(given or {})
+    for signal in whole:
         if signal not in SIGNALS:
             raise problem(
                 source,
-                f"units names {signal!r}{near(signal, SIGNALS)}",
-                f"give units for {', '.join(SIGNALS)} only",
+                f"{what} names {signal!r}{near(signal, SIGNALS)}",
+                f"give {what} for {', '.join(SIGNALS)} only",
             )
     for signal, other in _SAME_UNIT_AS.items():
-        if signal not in given and other in given:
-            given[signal] = given[other]
-    return {signal: _factor(source, signal, given.get(signal)) for signal in SIGNALS}
+        if signal not in whole and other in whole:
+            whole[signal] = whole[other]
+    return whole
+
+
+def _scale(source: str, signal: str, given: Any) -> Float64[np.ndarray, " factors"]:
+    try:
+        times = np.atleast_1d(np.asarray(given, dtype=np.float64))
+    except (TypeError, ValueError):
+        times = np.array([np.nan])
+    if times.ndim != 1 or not times.size or not (np.isfinite(times) & (times != 0)).all():
+        raise problem(
+            source,
+            f"scale of {signal} is {brief(given)}",
+            "give one factor that is not zero, or one for each joint, such as torque constant "
+            "times gear ratio",
+        )
+    return times
 
 
 def _factor(

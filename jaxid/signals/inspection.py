@@ -1,14 +1,16 @@
 """What recordings are like before any model: rates, gaps, ranges, quantisation, rests, repeats."""
 
 import html
+import itertools
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
 
-from ..recording import Recording, Recordings
-from .smoothing import even_times, signal_cutoff, smooth_motion
+from ..recording import Recording, Recordings, is_decimal, missing_after, step_of
+from .sampling import follows, held, is_followed, period
+from .smoothing import even_times, resampled, signal_cutoff, smooth_motion
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,18 +19,21 @@ if TYPE_CHECKING:
 _REST = 0.01
 # Share of it that a joint reaches in both directions where it turns.
 _TURN = 0.1
-# Correlation from which two references are one.
+# Correlation from which two references of one size are one.
 _SAME = 0.9999
 
 
 class Inspection(eqx.Module):
     """What `inspect` found.
 
-    - `signals`: one row for each recording: samples, rate in Hz, duration in s, jitter of its times
-      and largest time between two, whether it has a reference and velocities, and the frequency up
-      to which its motion is known.
+    - `signals`: one row for each recording: samples, rate in Hz, duration in s, jitter of times,
+      largest time between two and number of gaps, whether it has a reference and velocities, the
+      time after which the reference repeats itself, and the frequency up to which the motion is
+      known.
     - `joints`: one row for each recording and joint: range of q, top speed, share of time at rest,
-      how often it turns, torque, and the smallest step between two readings of q.
+      how often it turns, torque, the step that all readings of q are multiples of (nil without
+      one), and what is seen of a sampled law: `"every 4"` where torque is held for so many samples,
+      `"each"` where it follows the readings sample by sample, `"-"` for nothing.
     - `repeats`: pairs of recordings whose references are the same.
     - `notes`: what to mend, or to know.
     """
@@ -39,10 +44,9 @@ class Inspection(eqx.Module):
     notes: tuple[str, ...] = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        import pandas as pd
-
-        with pd.option_context("display.width", 80, "display.precision", 4):
-            parts = [self.signals.to_string(), self.joints.to_string()]
+        parts = [
+            table.to_string(float_format="{:.4g}".format) for table in (self.signals, self.joints)
+        ]
         same = [f"{a} and {b} repeat one reference" for a, b in self.repeats]
         return "\n".join([*parts, *same, *self.notes])
 
@@ -81,7 +85,7 @@ def inspect(recordings: Recording | Recordings | Iterable[Recording]) -> Inspect
     return Inspection(
         pd.DataFrame(signals).set_index("recording"),
         table,
-        repeated(recordings),
+        repeats_of(recordings),
         tuple(_notes(recordings, table)),
     )
 
@@ -95,9 +99,30 @@ def _times(r: Recording) -> dict[str, Any]:
         "s": r.duration,
         "jitter ms": 1e3 * float(np.quantile(np.abs(steps - r.period), 0.9)),
         "gap ms": 1e3 * float(steps.max()),
+        "gaps": int(missing_after(r.time).sum()),
         "q_ref": r.q_ref is not None,
         "v": r.v is not None,
+        "repeats s": _period(r),
     }
+
+
+def _period(r: Recording) -> float:
+    """Seconds after which the reference, or else the motion, repeats itself; nil if it does not."""
+    x = resampled(r.time, r.q if r.q_ref is None else r.q_ref, even_times(r))
+    found = period(x)
+    return 0.0 if found is None else found * r.duration / (r.samples - 1)
+
+
+def _law(r: Recording, joint: int) -> str:
+    """What the torque of a joint shows of a sampled law."""
+    # At a gap position and torque jump together.
+    edges = [0, *(np.flatnonzero(missing_after(r.time)) + 1).tolist(), r.samples]
+    whole = max(itertools.pairwise(edges), key=lambda piece: piece[1] - piece[0])
+    tau, q = r.tau[slice(*whole), joint], r.q[slice(*whole), joint]
+    if (samples := held(tau)) > 1:
+        return f"every {samples}"
+    # The reference adds nothing that the encoder did not say.
+    return "each" if is_followed(follows(q, tau)) else "-"
 
 
 def _by_joint(r: Recording, cutoff: float) -> list[dict[str, Any]]:
@@ -108,7 +133,6 @@ def _by_joint(r: Recording, cutoff: float) -> list[dict[str, Any]]:
     rows = []
     for j in range(r.joints):
         moving = np.sign(speed[np.abs(speed[:, j]) > _TURN * top[j], j])
-        moves = np.abs(np.diff(r.q[:, j]))
         rows.append(
             {
                 "recording": r.name,
@@ -120,38 +144,53 @@ def _by_joint(r: Recording, cutoff: float) -> list[dict[str, Any]]:
                 "turns": int(np.sum(moving[1:] != moving[:-1])),
                 "tau rms": float(np.sqrt(np.mean(r.tau[:, j] ** 2))),
                 "tau peak": float(np.abs(r.tau[:, j]).max()),
-                "q step": float(np.min(moves[moves > 0], initial=np.inf)),
+                "q step": step_of(r.q[:, j]) or 0.0,
+                "law": _law(r, j),
             }
         )
     return rows
 
 
-def repeated(recordings: Recordings) -> tuple[tuple[str, str], ...]:
+def repeats_of(recordings: Recordings) -> tuple[tuple[str, str], ...]:
     """Names of recordings that follow the same reference, or the same motion where none is given.
 
     **Arguments:**
 
     - `recordings`: of one robot.
     """
-    found = []
-    for k, one in enumerate(recordings):
-        for other in list(recordings)[k + 1 :]:
-            pair = [x.q if x.q_ref is None else x.q_ref for x in (one, other)]
-            length = min(len(x) for x in pair)
-            if abs(one.period / other.period - 1) > 0.01 or length < 0.9 * max(map(len, pair)):
-                continue
-            a, b = (x[:length] - x[:length].mean(axis=0) for x in pair)
-            size = np.linalg.norm(a) * np.linalg.norm(b)
-            if size > 0 and float(np.sum(a * b)) > _SAME * size:
-                found.append((one.name, other.name))
-    return tuple(found)
+    return tuple(
+        (one.name, other.name)
+        for one, other in itertools.combinations(recordings, 2)
+        if _repeat(one, other)
+    )
+
+
+def _repeat(one: Recording, other: Recording) -> bool:
+    """Whether two recordings have the same reference, or else motion, by the clock or its start."""
+    x, y = (r.q if r.q_ref is None else r.q_ref for r in (one, other))
+    for start in (0.0, one.time[0]):
+        s, t = one.time - start, other.time - (start and other.time[0])
+        # A reference moves little between two samples, which are at other times in the other.
+        both = (s >= t[0]) & (s <= t[-1])
+        if both.mean() < 0.9 or t[-1] - t[0] > 1.1 * (s[-1] - s[0]):
+            continue
+        a = x[both] - x[both].mean(axis=0)
+        b = np.column_stack([np.interp(s[both], t, column) for column in y.T])
+        b -= b.mean(axis=0)
+        size = np.linalg.norm(a) * np.linalg.norm(b)
+        if size > 0 and float(np.sum((a - b) ** 2)) < 2 * (1 - _SAME) * size:
+            return True
+    return False
 
 
 def _notes(recordings: Recordings, joints: "pd.DataFrame") -> list[str]:
     notes = []
-    if len({round(r.rate, 1) for r in recordings}) > 1:
-        rates = ", ".join(f"{r.name} {r.rate:.4g} Hz" for r in recordings)
-        notes.append(f"sample rates differ ({rates}): a discovery needs one rate")
+    slow, fast = (choose(recordings, key=lambda r: r.rate) for choose in (min, max))
+    if fast.rate > 1.01 * slow.rate:
+        notes.append(
+            f"sample rates differ, from {slow.rate:.4g} Hz ({slow.name}) to {fast.rate:.4g} Hz "
+            f"({fast.name}): a discovery needs one rate"
+        )
     for j in range(1, recordings.joints + 1):
         rows = joints.xs(j, level="joint")
         if max(rows["turns"].tolist()) < 2:
@@ -164,6 +203,79 @@ def _notes(recordings: Recordings, joints: "pd.DataFrame") -> list[str]:
                 f"joint {j} rests for most of every recording: its inertia and friction will be "
                 "known badly"
             )
+    notes += [note for r in recordings for note in _notes_on_times(r)]
+    notes += _notes_on_clocks(recordings, joints)
     if len(recordings) == 1:
         notes.append("one recording alone: record another to be held out of the fit")
     return notes
+
+
+def _notes_on_times(r: Recording) -> list[str]:
+    """Gaps of a recording, and its reference where that repeats or has a clock of its own."""
+    notes = []
+    gaps = np.flatnonzero(missing_after(r.time))
+    if len(gaps):
+        longest = gaps[np.argmax(np.diff(r.time)[gaps])]
+        notes.append(
+            f"{r.name} has {len(gaps)} gap{'s' * (len(gaps) > 1)}, the longest of "
+            f"{r.time[longest + 1] - r.time[longest]:.4g} s after {r.time[longest]:.6g} s: "
+            "commands need --gaps allow"
+        )
+    if every := _period(r):
+        what = "motion" if r.q_ref is None else "reference"
+        notes.append(
+            f"the {what} of {r.name} repeats every {every:.4g} s, {r.duration / every:.3g} times: "
+            "what differs between periods is noise, or changes with time"
+        )
+    if r.q_ref is not None:
+        samples = max(held(column) for column in r.q_ref.T)
+        if samples > 1:
+            notes.append(
+                f"the reference of {r.name} is held for {samples} samples "
+                f"({1e3 * samples * r.period:.4g} ms): it has another clock than the log"
+            )
+    return notes
+
+
+def _notes_on_clocks(recordings: Recordings, joints: "pd.DataFrame") -> list[str]:
+    """Encoder steps and the law's clock, each said once for all recordings that agree."""
+    notes = []
+    smallest: dict[str, list[int]] = {}
+    for j in range(1, recordings.joints + 1):
+        rows = joints.xs(j, level="joint")
+        steps = [float(x) for x in rows["q step"].tolist() if x > 0]
+        if steps:
+            origin = "digits of the file" if is_decimal(min(steps)) else "encoder counts"
+            smallest.setdefault(f"{min(steps):.4g}, {origin}", []).append(j)
+    for step, numbers in smallest.items():
+        notes.append(f"{_listed(numbers)} read in steps of {step}")
+    for law, numbers in sorted(_joints_by_law(joints).items()):
+        if law == "each":
+            notes.append(
+                f"torque of {_listed(numbers)} computed from these very readings, by its coherence "
+                "with them: a law sampled at the log's rate or above, such as control.Sampled"
+            )
+        else:
+            samples = int(law.removeprefix("every "))
+            every = samples * recordings[0].period
+            notes.append(
+                f"torque of {_listed(numbers)} held for {samples} samples: a law sampled every "
+                f"{1e3 * every:.4g} ms, such as control.Sampled(every={every:.4g})"
+            )
+    return notes
+
+
+def _listed(numbers: list[int]) -> str:
+    """Joints by number, with the verb that follows."""
+    several = len(numbers) > 1
+    return f"joint{'s' * several} {', '.join(map(str, numbers))} {'are' if several else 'is'}"
+
+
+def _joints_by_law(joints: "pd.DataFrame") -> dict[str, list[int]]:
+    found: dict[str, list[int]] = {}
+    for law, joint in zip(joints["law"], joints.index.get_level_values("joint"), strict=True):
+        listed = found.setdefault(str(law), [])
+        if joint not in listed:
+            listed.append(int(joint))
+    found.pop("-", None)
+    return found

@@ -1,0 +1,31 @@
+"""What a user says of recordings: which columns, in what units, and what to put up with."""
+
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import numpy as np
+
+from ._checks import Accept
+from ._units import Units
+
+Columns = Mapping[str, str | Sequence[str]]
+Scale = Mapping[str, float | int | Sequence[float]]
+Resolution = float | int | Sequence[float] | np.ndarray
+
+
+class Description(eqx.Module):
+    """The arguments of `jaxid.read` that say what is in a file.
+
+    - `columns`: our names to theirs.
+    - `joints`: names of joints, in the order of the robot, where columns carry them.
+    - `units`, `scale`: unit and factor by signal.
+    - `resolution`: encoder step, rad or m.
+    - `accept`: what of the faults to put up with.
+    """
+
+    columns: Columns | None = None
+    joints: Sequence[str] | None = None
+    units: Units | None = None
+    scale: Scale | None = None
+    resolution: Resolution | None = None
+    accept: Accept = Accept()

@@ -1,0 +1,54 @@
+"""Named columns as a file or a table in memory has them."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+
+from ..errors import brief
+from ._problem import problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class Table(eqx.Module):
+    """Named columns of one file, not yet looked at.
+
+    - `columns`: array-likes, or streams of their own times, by name.
+    - `refused`: names what the file also holds but cannot be a column, and says what it is.
+    - `lines`: of the rows in a text file.
+    - `defaults`: where joints have names, the column of each by signal and joint; in the order of
+      the robot where `ordered`.
+    - `unclear`: why a signal has no such columns though there are some.
+    - `about`: what else is to be said of the file, a line each.
+    """
+
+    columns: dict[str, object]
+    refused: dict[str, str] = eqx.field(default_factory=dict)
+    lines: tuple[int, ...] = ()
+    defaults: dict[str, dict[str, str]] = eqx.field(default_factory=dict)
+    ordered: bool = False
+    unclear: dict[str, str] = eqx.field(default_factory=dict)
+    about: tuple[str, ...] = ()
+
+
+def from_frame(source: str, frame: "pd.DataFrame", lines: tuple[int, ...] = ()) -> Table:
+    """The columns of a DataFrame, each named once."""
+    named = isinstance(frame.index.name, str) and frame.index.name not in frame.columns
+    # Times are often the index.
+    frame = frame.reset_index() if named else frame
+    names = [str(name).strip() for name in frame.columns]
+    unique(source, names)
+    return Table({name: frame.iloc[:, i] for i, name in enumerate(names)}, {}, lines)
+
+
+def unique(source: str, names: Sequence[str]) -> None:
+    """Raises `RecordingError` when a name that is not empty appears twice."""
+    seen = set()
+    for name in filter(None, names):
+        if name in seen:
+            raise problem(
+                source, f"column {brief(name)} appears more than once", "rename or remove one"
+            )
+        seen.add(name)

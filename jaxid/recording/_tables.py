@@ -1,0 +1,35 @@
+"""Tables in memory, of whatever library, as pandas has them."""
+
+from typing import TYPE_CHECKING
+
+from ..errors import brief, require
+from ._problem import problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def frame_of(source: str, table: object) -> "pd.DataFrame":
+    """A DataFrame of a table that is one, or that Arrow can take.
+
+    **Arguments:**
+
+    - `source`: what messages call it.
+    - `table`: a pandas DataFrame, an Arrow table, or another with `__arrow_c_stream__`.
+
+    **Raises:** `RecordingError` for what is no table; `MissingExtraError` without the extra
+        `parquet` for a table that is not of pandas.
+    """
+    import pandas as pd
+
+    if isinstance(table, pd.DataFrame):
+        return table
+    if not hasattr(table, "__arrow_c_stream__"):
+        raise problem(
+            source,
+            f"{brief(table)} is no table",
+            "give a pandas DataFrame or an Arrow table, or use Recording.from_arrays",
+        )
+    arrow = require("pyarrow", "parquet")
+    # The metadata of pandas could make a column an index and so hide it.
+    return arrow.table(table).to_pandas(ignore_metadata=True)
