@@ -1,12 +1,13 @@
 """Recordings with a mistake in them: none may end as `adequate` or `explained`.
 
-Robots of the worlds bench (MuJoCo), read with one mistake: a torque's sign, a position in degrees or
-millimetres, the torques of two joints swapped, a clock twice as fast, torque that is noise, a joint
-that stands still, another robot's drawing, or a drive that is at its limit for most of the time. The
-law is unknown. A mistake that the free parameters of the model absorb cannot be seen in the data:
-such a case counts as described where the model leaves no more than it does without the mistake.
+Robots of the worlds bench (MuJoCo), read with one mistake: a torque's sign, a position in degrees
+or millimetres, the torques of two joints swapped, a clock twice as fast, torque that is noise, a
+joint that stands still, another robot's drawing, or a drive that is at its limit for most of the
+time. The law is unknown. Free bodies absorb some of these: a clock twice as fast is an inertia of a
+quarter. With `--bodies drawn` the bodies are those of the URDF, wrong by up to a quarter.
 
 python -m benchmarks.mistakes [--quick] [--json FILE] [--seed N] [--count 24]
+                              [--bodies free|drawn]
 """
 
 import argparse
@@ -92,7 +93,13 @@ def broken(case: Case, name: str, joint: int) -> Case:
 
 
 def run_case(seed: int, number: int, name: str, bodies: str) -> dict[str, Any]:
-    """One case: what the discovery says, and what it says without the mistake."""
+    """One case: what the discovery says of it.
+
+    **Arguments:**
+
+    - `number`: says which robot and joint. `name`: of the mistake.
+    - `bodies`: "free" or "drawn".
+    """
     robots = ("planar", "scara", "gantry", "polar") if name != "torques swapped" else ("planar",)
     robot = robots[number % len(robots)]
     wanted = draw_wanted(seed + number, 1, ("unknown",), robot)[0]
