@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constr
 REQUIREMENTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types check docs clean
+.PHONY: help demo test lint types check docs dist clean
 
 help:
 	@echo "make demo    the story on bundled recordings"
@@ -15,6 +15,7 @@ help:
 	@echo "make types   pyright"
 	@echo "make check   test, lint and types"
 	@echo "make docs    the documentation, in site/"
+	@echo "make dist    wheel and sdist, in dist/"
 	@echo "make clean   remove the virtual environment and caches"
 
 demo: .venv/.installed
@@ -34,6 +35,9 @@ check: test lint types
 
 docs: .venv/.installed-dev
 	$(BIN)/python -m mkdocs build --strict
+
+dist: .venv/.installed-dev
+	$(BIN)/python -m hatchling build -d dist
 
 clean:
 	rm -rf .venv .pytest_cache .ruff_cache .hypothesis build dist

@@ -1,6 +1,6 @@
-"""Pictures of what each effect of the catalogue leaves of a fit that lacks it: docs/img/effects.
+"""Pictures of each effect, and of the residual of a fit without it: docs/img/effects.
 
-python docs/pictures.py    needs the extra `static`; about a minute
+PYTHONPATH=. python docs/pictures.py    needs the extra `static`; about a minute
 """
 
 from pathlib import Path
@@ -34,21 +34,27 @@ def main() -> None:
         # The lighter joint shows most; some effects are on neither or on both.
         shown = next((v for v in forms if v.hypothesis.joint == 2), forms[0])
         path = OUT / f"{effect.__name__}.png"
-        draw(diagnosis, shown).write_image(path, width=760, height=210, scale=1)
+        draw(diagnosis, shown).write_image(path, width=900, height=230, scale=1)
         print(path.name, path.stat().st_size)
 
 
-def left(diagnosis: jaxid.Diagnosis, verdict: Verdict) -> Float[np.ndarray, "recordings samples 2"]:
-    """What the effect would leave of the torque once the fit has bent its parameters to it."""
+def waves(
+    diagnosis: jaxid.Diagnosis, verdict: Verdict
+) -> tuple[Float[np.ndarray, "recordings samples 2"], Float[np.ndarray, "recordings samples 2"]]:
+    """The torque that the effect asks for, and what a fit without the effect leaves of it.
+
+    The fitted parameters change so as to make up for the effect as far as they can; what remains
+    is the residual.
+    """
     data, columns = diagnosis.data, list(verdict.hypothesis.columns)
     # The first amplitude alone: of a sine and a cosine, one says what both look like.
     wave = data.table[..., columns[0]]
-    size = np.sqrt(np.mean(wave**2, axis=(0, 1)))
+    size = np.sqrt(np.mean(wave**2, axis=(0, 1))).max()
     weights = 1 / np.sqrt(np.mean(data.residual**2, axis=(0, 1)))
     base = data.base * weights[:, None]
     flat = base.reshape(-1, base.shape[-1])
     bent = np.linalg.lstsq(flat, (wave * weights).ravel(), rcond=None)[0]
-    return (wave - data.base @ bent) / size.max()
+    return wave / size, (wave - data.base @ bent) / size
 
 
 def telling(diagnosis: jaxid.Diagnosis, wave: np.ndarray, joint: int) -> tuple[Curve, np.ndarray]:
@@ -73,33 +79,52 @@ def telling(diagnosis: jaxid.Diagnosis, wave: np.ndarray, joint: int) -> tuple[C
 
 
 def draw(diagnosis: jaxid.Diagnosis, verdict: Verdict) -> go.Figure:
-    """In time on the left, against the coordinate that shows it on the right."""
-    wave = left(diagnosis, verdict)
-    power = np.mean(wave**2, axis=(0, 1))
+    """The effect against its coordinate; the residual in time and against its coordinate."""
+    whole, rest = waves(diagnosis, verdict)
+    power = np.mean(rest**2, axis=(0, 1))
     joint = verdict.hypothesis.joint or int(power.argmax()) + 1
-    recording = int(np.mean(wave[..., joint - 1] ** 2, axis=1).argmax())
+    recording = int(np.mean(rest[..., joint - 1] ** 2, axis=1).argmax())
+    titles = ("torque of the effect", "residual of a fit without it", "the same residual")
+    widths = [0.27, 0.44, 0.29]
+    figure = make_subplots(
+        1, 3, column_widths=widths, horizontal_spacing=0.075, subplot_titles=titles
+    )
+    mask = diagnosis.data.mask
+    time, first = diagnosis.fit.recordings[recording].time, rest[recording, mask[recording]]
+    line = {"color": figures.ORANGE, "width": 1.6}
+    figure.add_scatter(x=time, y=first[:, joint - 1], mode="lines", line=line, row=1, col=2)
+    figure.update_xaxes(title_text="time (s)", row=1, col=2)
+    cloud(figure, diagnosis, whole, joint, column=1, colour=figures.BLUE)
+    cloud(figure, diagnosis, rest, joint, column=3, colour=figures.ORANGE)
+    figure.update_layout(template=figures.theme(), showlegend=False)
+    figure.update_layout(margin={"l": 45, "r": 10, "t": 28, "b": 45})
+    figure.update_annotations(font_size=12.5)
+    figure.update_yaxes(showticklabels=False)
+    return figure
+
+
+def cloud(
+    figure: go.Figure,
+    diagnosis: jaxid.Diagnosis,
+    wave: Float[np.ndarray, "recordings samples 2"],
+    joint: int,
+    column: int,
+    colour: str,
+) -> None:
+    """A torque against the coordinate on which it depends most."""
     curve, x = telling(diagnosis, wave, joint)
     mask, motion = diagnosis.data.mask, diagnosis.motion
     y = wave[..., joint - 1][mask]
     if curve.signed:
         y = y * np.sign(np.asarray(motion.v)[..., joint - 1][mask])
-    figure = make_subplots(rows=1, cols=2, column_widths=[0.6, 0.4], horizontal_spacing=0.09)
-    time, first = diagnosis.fit.recordings[recording].time, wave[recording, mask[recording]]
-    line = {"color": figures.ORANGE, "width": 1.6}
-    figure.add_scatter(x=time, y=first[:, joint - 1], mode="lines", line=line)
-    dots = {"color": figures.BLUE, "size": 3, "opacity": 0.5}
+    dots = {"color": colour, "size": 3, "opacity": 0.5}
     few = np.random.default_rng(0).permutation(len(x))[:600]
-    figure.add_scatter(x=x[few], y=y[few], mode="markers", marker=dots, row=1, col=2)
+    figure.add_scatter(x=x[few], y=y[few], mode="markers", marker=dots, row=1, col=column)
     torque, position = diagnosis.fit.loop.arm.units()
     unit = coordinate_unit(curve, torque, position)
-    figure.update_layout(template=figures.theme(), showlegend=False)
-    figure.update_layout(margin={"l": 50, "r": 10, "t": 10, "b": 45})
-    figure.update_xaxes(title_text="time (s)", row=1, col=1)
-    figure.update_xaxes(title_text=f"{curve.spoken_coordinate} ({unit})", row=1, col=2)
-    figure.update_yaxes(showticklabels=False)
-    figure.update_yaxes(title_text=f"torque {joint}", row=1, col=1)
-    figure.update_yaxes(title_text="× sign of v" if curve.signed else None, row=1, col=2)
-    return figure
+    figure.update_xaxes(title_text=f"{curve.spoken_coordinate} ({unit})", row=1, col=column)
+    factor = " × sign of v" if curve.signed else ""
+    figure.update_yaxes(title_text=f"torque {joint}{factor}", row=1, col=column)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,8 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
 
+__version__ = "0.1.0"
+
 # JAX hangs a callback on the garbage collector, in which a Ctrl-C gets lost. Importing takes
 # seconds, and nothing of it is garbage.
 _collecting = _gc.isenabled()

@@ -151,7 +151,7 @@ def test_another_plan_is_refused(tmp_path: Path) -> None:
         dict(campaign.run(draw, {"a": 1}))
     with Campaign(tmp_path / "c", {"seed": 7, "x": np.ones(3)}):
         pass
-    with pytest.raises(SaveError, match=r"not the same: seed, x\)"):
+    with pytest.raises(SaveError, match=r"different: seed, x\)"):
         Campaign(tmp_path / "c", {"seed": 8, "x": np.zeros(3)}).__enter__()
 
 
@@ -180,7 +180,7 @@ def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
             Campaign(folder, {}).__enter__()
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "plan.json").write_text("[" * 5000)
-    with pytest.raises(SaveError, match="no plan of a campaign"):
+    with pytest.raises(SaveError, match="not a plan of a campaign"):
         Campaign(tmp_path / "c", {}).__enter__()
 
 

@@ -92,9 +92,9 @@ def test_interrupted_discovery_ends_as_an_undisturbed_one(offset_case, offset_st
 def test_steps_of_other_work_are_refused(offset_case, offset_story):
     _, journal = offset_story
     fit, held_out = recordings_of(offset_case)
-    with pytest.raises(jaxid.errors.SaveError, match=r"other work \(not the same: search\)"):
+    with pytest.raises(jaxid.errors.SaveError, match=r"another computation \(different: search\)"):
         jaxid.discover(jaxid.scara(), fit[:1], held_out, resume=journal, progress=False)
-    with pytest.raises(jaxid.errors.SaveError, match=r"other work \(not the same: search\)"):
+    with pytest.raises(jaxid.errors.SaveError, match=r"another computation \(different: search\)"):
         jaxid.discover(jaxid.scara(), fit, held_out, most=2, resume=journal, progress=False)
 
 
@@ -106,7 +106,7 @@ def test_recordings_of_different_rates_share_no_noise_filter():
 
     both = [at(100), at(200)]
     for method in (jaxid.SeparablePEM(), jaxid.JointPEM()):
-        with pytest.raises(jaxid.errors.RecordingError, match="a noise filter is of one rate"):
+        with pytest.raises(jaxid.errors.RecordingError, match="a noise filter holds for one rate"):
             jaxid.fit(jaxid.scara(), both, method)
     with pytest.raises(jaxid.errors.RecordingError, match="200 samples a second"):
         jaxid.discover(jaxid.scara(), both[0], both[1], progress=False)

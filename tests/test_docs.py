@@ -92,6 +92,14 @@ def test_every_effect_of_the_catalogue_is_described_and_drawn() -> None:
         assert (DOCS / "img" / "effects" / f"{name}.png").stat().st_size > 5000
 
 
+def test_pictures_of_look_alikes_are_there() -> None:
+    text = (DOCS / "look-alikes.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"\]\(img/alike/(\w+\.png)\)", text))
+    drawn = {path.name for path in (DOCS / "img" / "alike").glob("*.png")}
+    assert named == drawn
+    assert len(drawn) > 5
+
+
 def test_pictures_named_in_the_readme_are_there_and_small() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     named = re.findall(r"\]\((docs/[^)#]+)", text)
@@ -135,3 +143,47 @@ def test_code_of_bring_your_own_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     reading, reference = Reading(none, none), Reference(q, none, none, none)
     state = law.initial_state(reading) + law.derivative(reading, reference, none)
     np.testing.assert_allclose(law.command(reading, reference, state, jnp.eye(3)), 3 * q)
+
+
+def blocks(page: str) -> list[str]:
+    """The Python code of a page, block by block."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+def moved(joints: int) -> jaxid.Recording:
+    """A reference that starts at rest and moves by a tenth of a radian in a second."""
+    time = np.arange(0.0, 1.0, 0.002)
+    q_ref = 0.1 * np.stack([np.sin(1.5 * time) ** 2] * joints, axis=1)
+    return jaxid.Recording(time, q_ref, np.zeros_like(q_ref), q_ref=q_ref)
+
+
+def test_every_law_of_the_docs_follows_its_reference() -> None:
+    own: dict[str, Any] = {}
+    loops: list[jaxid.ClosedLoop] = []
+    for block in blocks("laws.md"):
+        exec(block, own)
+        found = [v for v in own.values() if isinstance(v, jaxid.ClosedLoop)]
+        loops += [loop for loop in found if not any(loop is had for had in loops)]
+    assert len(loops) == 5
+    laws = [type(loop.controller).__name__ for loop in loops]
+    assert laws == ["PD", "PID", "PositionVelocity", "ComputedTorque", "Sampled"]
+    servo = jaxid.ClosedLoop(jaxid.arms.Axis(M=0.01), own["servo"], [jaxid.effects.Viscous(1, 0.3)])
+    for loop in (*loops, servo):
+        run = jaxid.simulate(loop, moved(loop.joints))[0]
+        # The PD law lags by Kv/Kp = 0.2 s, at 0.15 rad/s; without control the error is 0.1 rad.
+        away = np.abs(np.asarray(run.q) - moved(loop.joints).q_ref).max()
+        assert away < 0.05, loop.controller
+
+
+def test_the_cascade_of_the_docs_is_a_pi_law_in_closed_form() -> None:
+    own: dict[str, Any] = {}
+    for block in blocks("laws.md")[:3]:
+        exec(block, own)
+    law = own["PositionVelocity"]()
+    reading = Reading(jnp.array([0.1]), jnp.array([0.2]))
+    reference = Reference(*(jnp.array([x]) for x in (0.3, 0.4, 0.0, 0.5)))
+    error = 20.0 * 0.2 + 0.4 - 0.2
+    np.testing.assert_allclose(law.derivative(reading, reference, jnp.zeros(1)), [error])
+    held = law.command(reading, reference, jnp.array([0.01]), jnp.eye(1))
+    np.testing.assert_allclose(held, [8.0 * error + 40.0 * 0.01 + 0.5])

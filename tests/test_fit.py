@@ -230,7 +230,9 @@ def test_regressions_say_what_they_cannot_see(cases):
     one = both(cases[0])[0]
     for effect in (EncoderEccentricity(joint=1), JointElasticity(joint=1)):
         for method in (jaxid.IDIM(), jaxid.DIDIM(), jaxid.IDIMIV(), jaxid.IntegralLS()):
-            with pytest.raises(FitError, match=f"{effect.effect_name()} sets apart: use OEM"):
+            with pytest.raises(
+                FitError, match=f"which differ with {effect.effect_name()}: use OEM"
+            ):
                 jaxid.fit(jaxid.scara().add(effect), one, method)
     held = jaxid.scara().hold(*jaxid.scara().names)
     for method in (jaxid.IDIM(), jaxid.IntegralLS(), jaxid.SeparablePEM()):

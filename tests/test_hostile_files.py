@@ -177,7 +177,7 @@ def test_matlab_files_of_every_kind(tmp_path: Path) -> None:
 def test_pipes_and_devices_are_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "run.csv")
     for path in (tmp_path / "run.csv", Path("/dev/zero")):
-        with pytest.raises(RecordingError, match="no plain file"):
+        with pytest.raises(RecordingError, match="not a plain file"):
             read(path)
 
 

@@ -52,7 +52,7 @@ def test_what_is_in_a_recording_is_what_was_put_there(tmp_path):
     assert found.joints.loc[("one", 2), "rest %"] == pytest.approx(70, abs=10)
     assert found.signals.loc["one", "Hz"] == pytest.approx(100)
     assert found.repeats == (("one", "other"),)
-    assert any("joint 2 hardly reverses" in note for note in found.notes)
+    assert any("joint 2 rarely reverses" in note for note in found.notes)
     assert "one and other repeat" in repr(found)
     assert "one and other repeat" in found._repr_html_()
     assert json.loads(json.dumps(found.to_dict()))["repeats"] == [["one", "other"]]

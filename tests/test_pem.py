@@ -217,7 +217,7 @@ def test_a_limit_of_time_holds_for_joint_prediction_error_too(recording):
     hurried = jaxid.OEM(start="given", progress=False, max_seconds=0.0)
     fit = jaxid.fit(jaxid.scara(), recording, jaxid.JointPEM(hurried, orders=ORDERS))
     assert fit.status is jaxid.Status.max_seconds
-    with pytest.raises(FitError, match="see that it converges"):
+    with pytest.raises(FitError, match="make it converge first"):
         jaxid.bootstrap(fit, 4, progress=False)
 
 

@@ -1,4 +1,4 @@
-"""What every arm gives: its equations of motion, in base parameters."""
+"""Base class of arms: equations of motion in base parameters."""
 
 import abc
 
@@ -27,7 +27,7 @@ class Split(eqx.Module):
 class AbstractArm(eqx.Module):
     """Rigid bodies: `tau = mass_matrix(q) a + bias(q, v)`, linear in the base parameters.
 
-    Friction is not here: it is an effect like any other.
+    Friction is not part of an arm: it is an effect.
     """
 
     @property
@@ -48,13 +48,13 @@ class AbstractArm(eqx.Module):
     def inverse(
         self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
     ) -> Float[Array, " joints"]:
-        """Torque that a motion takes, `(joints,)`, N·m or N."""
+        """Torque needed for a motion (inverse dynamics), `(joints,)`, N·m or N."""
         return self.mass_matrix(q) @ a + self.bias(q, v)
 
     def regressor(
         self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
     ) -> Float[Array, "joints parameters"]:
-        """Derivative of the torque by the base parameters, in the order of the fields.
+        """Derivative of the torque with respect to the base parameters, in the order of the fields.
 
         **Arguments:**
 
@@ -71,8 +71,8 @@ class AbstractArm(eqx.Module):
     def split(self, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Split:
         """The regressor in parts that need no acceleration.
 
-        By default from Lagrange's equations: momentum is what is differentiated, once. An arm
-        whose momentum has a part that is itself the rate of a position says so in its own.
+        The default follows from Lagrange's equations and differentiates the momentum once. An arm
+        whose momentum contains the rate of a function of position overrides this.
 
         **Arguments:**
 
@@ -93,19 +93,19 @@ class AbstractArm(eqx.Module):
         return Split(jnp.zeros_like(first), first, zeroth)
 
     def prismatic(self) -> tuple[bool, ...]:
-        """Which joints slide, one a joint; the others turn."""
+        """Whether each joint slides (prismatic); otherwise it turns."""
         return (False,) * self.joints
 
     def planar(self) -> bool:
-        """Whether its links move in one plane, their angles there the sums of the joints'."""
+        """Whether links move in one plane, link angles being sums of joint angles."""
         return True
 
     def couplings(self) -> tuple[tuple[int, int, float], ...]:
-        """Pairs of joints whose speeds some shaft may add, and its turns for one of the first."""
+        """Pairs of joints that may share a shaft, and its turns for one turn of the first joint."""
         return ()
 
     def link_lengths(self) -> tuple[float, ...]:
-        """Lengths of the links before the last, m; without them no payload is looked for."""
+        """Lengths of all links but the last, m; without them payloads are not considered."""
         return ()
 
     def first_moments(self) -> tuple[tuple[float, float] | None, ...]:
@@ -117,7 +117,7 @@ class AbstractArm(eqx.Module):
         return 0.0
 
     def units(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Units of torque and of position, one a joint each."""
+        """Units of torque and of position, one for each joint."""
         slides = self.prismatic()
         return (
             tuple("N" if slide else "N·m" for slide in slides),
@@ -131,7 +131,7 @@ class AbstractArm(eqx.Module):
             return turn[:, None]
         if self.joints == 2:
             return np.stack([np.zeros(25), turn], axis=1)
-        # A lattice over many joints would be too many; how the first stands does not matter.
+        # A grid over many joints would be too large; the first joint's position does not matter.
         drawn = np.random.default_rng(0).uniform(-np.pi, np.pi, (25 * self.joints, self.joints))
         return drawn * (np.arange(self.joints) > 0)
 

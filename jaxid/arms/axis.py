@@ -15,15 +15,15 @@ class Axis(AbstractArm):
 
     @property
     def joints(self) -> int:
-        """One."""
+        """One joint."""
         return 1
 
     def prismatic(self) -> tuple[bool, ...]:
-        """It slides."""
+        """The joint slides."""
         return (True,)
 
     def workspace(self) -> Float[np.ndarray, "points joints"]:
-        """The inertia is the same everywhere."""
+        """One position: the inertia does not depend on it."""
         return np.zeros((1, 1))
 
     def mass_matrix(self, q: Float[Array, " joints"]) -> Float[Array, "joints joints"]:

@@ -1,4 +1,4 @@
-"""A chain of joints in space: where its frames are, and what its bodies' motion takes."""
+"""A chain of joints in space: forward kinematics and inverse dynamics."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -6,8 +6,8 @@ from jaxtyping import Array, Float
 
 from ..parameters import as_float64
 
-# What a body's ten parameters are called (Khalil, Dombre 2002), without the link's number: inertia
-# about the origin of the link's frame, first moment, mass.
+# Names of a body's ten parameters (Khalil, Dombre 2002), without the link's number: inertia about
+# the origin of the link's frame, first moment, mass.
 BODY = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
 
 
@@ -28,7 +28,7 @@ class Chain(eqx.Module):
 
     @property
     def joints(self) -> int:
-        """How many."""
+        """Number of joints."""
         return len(self.slides)
 
     def frames(
@@ -60,7 +60,7 @@ class Chain(eqx.Module):
         v: Float[Array, " joints"],
         a: Float[Array, " joints"],
     ) -> Float[Array, " joints"]:
-        """Torque that a motion takes, `(joints,)`, N·m or N, by Newton's and Euler's equations.
+        """Torque needed for a motion, `(joints,)`, N·m or N, by the Newton-Euler equations.
 
         Forces and moments of the links beyond a joint are summed in the base's frame.
 

@@ -1,4 +1,4 @@
-"""Which bodies, if any, have base parameters that were estimated."""
+"""Physically consistent bodies for estimated base parameters."""
 
 import equinox as eqx
 import numpy as np
@@ -7,21 +7,21 @@ from jaxtyping import Float
 from ..errors import ModelError, require
 from .serial import SerialArm
 
-# Smallest eigenvalue of a body's scaled pseudo-inertia: bodies of the drawing that are points or
-# thin rods stay possible up to that.
+# Smallest allowed eigenvalue of a body's scaled pseudo-inertia, so that points and thin rods of a
+# drawing count as consistent.
 _LEAST = 1e-7
-# Distance, in deviations, below which the estimate itself is that of bodies.
+# Distance, in deviations, below which the estimate itself counts as physically consistent.
 _THERE = 1e-2
 
 
 class PhysicalBodies(eqx.Module):
-    """Bodies with masses and inertias that matter can have, next to estimated base parameters.
+    """The physically consistent bodies that are nearest to estimated base parameters.
 
-    - `bodies`: `BODY` of each link, SI units. Among all with these base parameters they are those
-      nearest to the drawing.
+    - `bodies`: `BODY` of each link, SI units. Among all bodies with these base parameters they are
+      the nearest to the drawing.
     - `base`: their base parameters.
-    - `distance`: how far these are from the estimated ones, in standard deviations; nil where
-      bodies have the estimated ones.
+    - `distance`: from these to the estimated ones, in standard deviations; zero where the estimate
+      is physically consistent.
     """
 
     bodies: Float[np.ndarray, "joints 10"]
@@ -30,26 +30,27 @@ class PhysicalBodies(eqx.Module):
 
     @property
     def possible(self) -> bool:
-        """Whether bodies have the estimated base parameters."""
+        """Whether the estimated base parameters are physically consistent."""
         return bool(self.distance == 0)
 
 
 def physical_bodies(
     arm: SerialArm, covariance: Float[np.ndarray, "base base"] | None = None
 ) -> PhysicalBodies:
-    """Bodies whose base parameters are nearest to an arm's, by a semidefinite program.
+    """The physically consistent bodies nearest to an arm's base parameters.
+
+    Solves a semidefinite program, for which the extra `sdp` must be installed.
 
     A body is physical where its pseudo-inertia is positive definite (Wensing, Kim, Slotine 2018;
-    Sousa, Cortesão 2014). Base parameters of a regression need not be those of any bodies: they
-    may stand for an effect that the model lacks, such as a spring that balances the arm. Asks for
-    the extra `sdp`.
+    Sousa, Cortesão 2014). Estimated base parameters need not belong to physical bodies: they may
+    have absorbed an effect that the model lacks, such as a spring that balances the arm.
 
     **Arguments:**
 
     - `arm`: with estimated base parameters.
-    - `covariance`: of these; each is as sure as it is large where None.
+    - `covariance`: of these; None takes the size of each parameter as its standard deviation.
 
-    **Raises:** `ModelError` where the program finds nothing; `MissingExtraError`.
+    **Raises:** `ModelError` where the program has no solution; `MissingExtraError`.
     """
     cvxpy = require("cvxpy", "sdp")
     require("clarabel", "sdp")
@@ -73,7 +74,7 @@ def physical_bodies(
     distance = size * float(np.linalg.norm(np.asarray(away.value) / size))
     distance = float(distance) if distance > _THERE else 0.0
     reached = base if distance == 0 else combined @ np.asarray(bodies.value)
-    # Of all bodies with these base parameters the ones most like the drawing.
+    # Among all bodies with these base parameters, those most like the drawing.
     told = np.linalg.norm(combined, axis=1) * np.abs(scale).max()
     same = cvxpy.multiply(1 / told, combined @ bodies - reached)
     moved = unknown - (drawn / scale).ravel()
@@ -106,7 +107,7 @@ def _pseudo_inertia(library, body):
 
 
 def _scales(arm: SerialArm) -> Float[np.ndarray, "joints 10"]:
-    """Sizes of each link's parameters: of a ball of its mass, as large as the arm's links are."""
+    """Scales of each link's parameters: those of a ball of its mass, as large as the links."""
     drawn = np.asarray(arm.bodies)
     mass = np.maximum(drawn[:, 9], 0.05 * drawn[:, 9].max())
     moment = np.linalg.norm(drawn[:, 6:9], axis=1)

@@ -23,15 +23,15 @@ class SCARA(AbstractArm):
 
     @property
     def joints(self) -> int:
-        """Two."""
+        """Two joints."""
         return 2
 
     def link_lengths(self) -> tuple[float, ...]:
-        """The first link's, m."""
+        """Length of the first link, m."""
         return (self.length,)
 
     def first_moments(self) -> tuple[tuple[float, float] | None, ...]:
-        """The second link's, kg·m; without gravity the first's does not show."""
+        """First moment of the second link, kg·m; without gravity the first link's has no effect."""
         return None, (float(self.MX2), float(self.MY2))
 
     def mass_matrix(self, q: Float[Array, " joints"]) -> Float[Array, "joints joints"]:

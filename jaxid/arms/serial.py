@@ -1,4 +1,4 @@
-"""A serial arm in space, of as many joints as it has, by the base parameters of its bodies."""
+"""A serial arm in space with any number of joints, in base parameters."""
 
 import os
 from functools import lru_cache
@@ -20,9 +20,9 @@ from .urdf import Described, read_urdf
 class SerialArm(AbstractArm):
     """A chain of turning and sliding joints, linear in its base parameters.
 
-    Of the ten parameters of each link a motion shows combinations alone (Gautier, Khalil 1990).
-    `base` holds these, each led by the parameter that it is named after; the other parameters stay
-    at the values of `bodies`. `SerialArm.from_urdf` makes one of a URDF file.
+    Torque depends only on some combinations of the ten parameters of each link (Gautier, Khalil
+    1990). `base` holds these combinations, each named after its leading parameter. The other
+    parameters stay at the values of `bodies`. `SerialArm.from_urdf` reads a URDF file.
 
     **Arguments:**
 
@@ -32,8 +32,8 @@ class SerialArm(AbstractArm):
       more than their own joint; None where each has its own.
     - `base`: values of the base parameters, `(base,)`, in kg·m², kg·m or kg as their names say;
       those of `bodies` by default.
-    - `leading`, `base_names`, `combined`: as `base_parameters` finds them, which it is asked where
-      they are left out.
+    - `leading`, `base_names`, `combined`: results of `base_parameters`, which is called where they
+      are left out.
     """
 
     chain: Chain = eqx.field(metadata=KNOWN)
@@ -63,7 +63,7 @@ class SerialArm(AbstractArm):
         gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
         gears: Any = None,
     ) -> "SerialArm":
-        """The arm that a URDF describes, from one of its links to another.
+        """The arm that a URDF describes, between two of its links.
 
         **Arguments:**
 
@@ -83,7 +83,7 @@ class SerialArm(AbstractArm):
         gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
         gears: Any = None,
     ) -> "SerialArm":
-        """The arm of a description that was read."""
+        """The arm of a URDF that was read."""
         if gears is not None and np.shape(gears) != (len(found.joints),) * 2:
             raise ModelError(
                 f"gears have shape {np.shape(gears)}, but the arm has {len(found.joints)} joints: "
@@ -106,24 +106,25 @@ class SerialArm(AbstractArm):
 
     @property
     def joints(self) -> int:
-        """As many as the chain has."""
+        """Number of joints of the chain."""
         return self.chain.joints
 
     def prismatic(self) -> tuple[bool, ...]:
-        """As the chain has them."""
+        """Whether each joint of the chain slides."""
         return self.chain.slides
 
     def inertias(self) -> Float[Array, "joints 10"]:
         """`BODY` of each link with these base parameters, SI units.
 
-        Torque is right with them; what no motion shows of them is as in `bodies`.
+        They give the right torque; the combinations that torque does not depend on are as in
+        `bodies`.
         """
         drawn = jnp.ravel(self.bodies)
         changed = self.base - self.combined @ drawn
         return drawn.at[jnp.asarray(self.leading)].add(changed).reshape(self.bodies.shape)
 
     def combinations(self) -> dict[str, str]:
-        """What each base parameter is the sum of."""
+        """Each base parameter as a sum of link parameters."""
         names = [f"{what}{k}" for k in range(1, self.joints + 1) for what in BODY]
         rows = np.asarray(self.combined)
         found = {}
@@ -150,11 +151,11 @@ class SerialArm(AbstractArm):
     def inverse(
         self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
     ) -> Float[Array, " joints"]:
-        """Torque that a motion takes, `(joints,)`, N·m or N, without the inertia matrix."""
+        """Torque needed for a motion, `(joints,)`, N·m or N, without forming the inertia matrix."""
         return self.chain.inverse(self.inertias(), q, v, a)
 
     def absorbed_rotors(self) -> tuple[bool, ...]:
-        """Of which joints the rotor's inertia is a part of base parameters, `(joints,)`."""
+        """Whether each joint's rotor inertia is part of a base parameter, `(joints,)`."""
         rows, a = _regressor(_geometry(self.chain), self.chain.slides, self.lower, self.upper)
         basis = np.linalg.qr(rows[:, np.asarray(self.leading)])[0]
         found = []
@@ -166,11 +167,11 @@ class SerialArm(AbstractArm):
         return tuple(found)
 
     def planar(self) -> bool:
-        """It moves in space."""
+        """False: the links move in space."""
         return False
 
     def couplings(self) -> tuple[tuple[int, int, float], ...]:
-        """As the gears have them; where none are declared, neighbours that turn, either way."""
+        """Pairs that `gears` couples; without `gears`, all neighbouring joints that turn."""
         if self.gears is None:
             turning = [not slides for slides in self.chain.slides]
             pairs = [j for j in range(1, self.joints) if turning[j - 1] and turning[j]]
@@ -183,18 +184,18 @@ class SerialArm(AbstractArm):
         )
 
     def gravity(self) -> float:
-        """Its size, m/s²."""
+        """Magnitude of gravity, m/s²."""
         return float(np.linalg.norm(np.asarray(self.chain.gravity)))
 
     def workspace(self) -> Float[np.ndarray, "points joints"]:
-        """Positions drawn between the limits, `(points, joints)`."""
+        """Random positions between the limits, `(points, joints)`."""
         low, high = np.asarray(self.lower), np.asarray(self.upper)
         return np.random.default_rng(0).uniform(low, high, (8 * self.joints, self.joints))
 
     def smallest_inertia(self) -> Float[Array, ""]:
         """Smallest eigenvalue of the mass matrix over the workspace; above zero when physical.
 
-        Bodies that are drawn as points leave it singular up to rounding, and rotors are not in it.
+        Bodies drawn as points make it singular up to rounding. Rotor inertias are not included.
         """
         masses = jax.vmap(self.mass_matrix)(jnp.asarray(self.workspace()))
         found = jnp.linalg.eigvalsh(masses)
@@ -267,8 +268,8 @@ def _base_parameters(
 def _led(place: int, chain: Chain) -> tuple[bool, int]:
     """Where a parameter stands among those that may lead a combination.
 
-    Mass, first moment along the axis and one moment across it go with the link before (Khalil,
-    Dombre 2002), and lead only where there is none that they could go with.
+    Mass, the first moment along the axis and one moment across it are combined with parameters of
+    the previous link (Khalil, Dombre 2002). They lead only where there is no such parameter.
     """
     axis = int(np.argmax(np.abs(np.asarray(chain.axes)[place // 10])))
     across = (axis + 2) % 3
@@ -283,12 +284,12 @@ def _regressor(
     lower: tuple[float, ...],
     upper: tuple[float, ...],
 ) -> tuple[Float[np.ndarray, "rows parameters"], Float[np.ndarray, "states joints"]]:
-    """Torque by all bodies' parameters at drawn states, a row a joint; and the accelerations."""
+    """Regressor of all bodies' parameters at random states, a row for each joint; accelerations."""
     chain, n = _chain(geometry, slides), len(slides)
     rng = np.random.default_rng(0)
     q = rng.uniform(lower, upper, (20 * n, n))
     v, a = rng.normal(size=(2, 20 * n, n))
-    # Torque is linear in the bodies, so that their derivative is the same everywhere.
+    # Torque is linear in the bodies' parameters, so its derivative is constant.
     by_bodies = jax.vmap(
         jax.jacfwd(lambda bodies, *at: chain.inverse(bodies, *at)), (None, 0, 0, 0)
     )

@@ -27,7 +27,7 @@ class TwoLink(AbstractArm):
 
     def __post_init__(self):
         if self.p3 is None and self.link_length is None:
-            # Links of a quarter metre: a start, not a fact.
+            # Links of a quarter metre: a start value only.
             self.p3 = 0.25 * self.p5
         elif self.p3 is not None and self.link_length is not None:
             raise ModelError(
@@ -36,7 +36,7 @@ class TwoLink(AbstractArm):
 
     @property
     def joints(self) -> int:
-        """Two."""
+        """Two joints."""
         return 2
 
     @property
@@ -48,15 +48,15 @@ class TwoLink(AbstractArm):
         return self.link_length * self.p5
 
     def link_lengths(self) -> tuple[float, ...]:
-        """The first link's as given, or as p3 / p5 has it, m."""
+        """Length of the first link as given, or p3 / p5, m."""
         return (self.link_length or float(self.coupling / self.p5),)
 
     def first_moments(self) -> tuple[tuple[float, float] | None, ...]:
-        """Both links', kg·m."""
+        """First moments of both links, kg·m."""
         return (float(self.p4), 0.0), (float(self.p5), 0.0)
 
     def gravity(self) -> float:
-        """As given, m/s²."""
+        """Gravity as given, m/s²."""
         return self.g
 
     def mass_matrix(self, q: Float[Array, " joints"]) -> Float[Array, "joints joints"]:

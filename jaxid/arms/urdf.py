@@ -18,7 +18,7 @@ _LARGEST = 20_000_000
 
 
 class DescribedJoint(eqx.Module):
-    """A joint that moves, as `Chain` has it, with its name, its link's name and its limits."""
+    """A moving joint as in `Chain`, with its name, its link's name and its limits."""
 
     name: str = eqx.field(static=True)
     link: str = eqx.field(static=True)
@@ -58,8 +58,8 @@ def read_urdf(
 ) -> Described:
     """The chain of joints from one link of a URDF to another.
 
-    What is fixed to a link of the chain, joints beyond the tip or off the chain at their zero
-    included, moves with it.
+    Everything that is fixed to a link of the chain moves with it. Joints beyond the tip or off the
+    chain are fixed at zero.
 
     **Arguments:**
 
@@ -114,7 +114,7 @@ def _parsed(source: str | os.PathLike[str]) -> tuple[Any, str]:
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
-        raise ModelError(f"{where} is not XML ({error}): mend that line") from error
+        raise ModelError(f"{where} is not XML ({error}): correct that line") from error
     if root.tag != "robot":
         hint = " (run xacro on it first)" if "xacro" in text else ""
         raise ModelError(f"{where} has <{root.tag}> at its top, where a URDF has <robot>{hint}")
@@ -168,7 +168,7 @@ def _tip(tip: str | None, base: str, links: dict, parents: dict, where: str) -> 
         if tip not in links:
             raise ModelError(f"{where} has no link {tip!r} for a tip: it has {', '.join(links)}")
         return tip
-    # A leaf is where nothing that moves comes after: flanges and tool frames are fixed.
+    # A leaf has no moving joint after it: flanges and tool frames are fixed.
     ends: dict[str, str] = {}
     carrying = {parent for parent, _ in parents.values()}
     for leaf in (name for name in links if name not in carrying):
@@ -285,7 +285,7 @@ def _bodies(
     count: int,
     where: str,
 ) -> tuple[Float[np.ndarray, "joints 10"], tuple[str, ...]]:
-    """The bodies of the chain's links, with all that hangs on them, and whose they are."""
+    """Bodies of the chain's links with all that is fixed to them, and the links' names."""
     found, carried = np.zeros((count, 10)), []
     for link, element in links.items():
         frame, at = (np.eye(3), np.zeros(3)), link
@@ -308,7 +308,7 @@ def _bodies(
 def _body(
     inertial: Any, frame: tuple[np.ndarray, np.ndarray], said: str
 ) -> Float[np.ndarray, "10"]:
-    """The ten parameters of a body in a frame, of an inertia that is given about its centre."""
+    """The ten parameters of a body in a frame, from its inertia about the centre of mass."""
     element, tensor = inertial.find("mass"), inertial.find("inertia")
     if element is None or tensor is None:
         raise ModelError(f"{said} has an <inertial> without its mass or inertia: give both")
@@ -317,7 +317,7 @@ def _body(
     values = [float(_numbers(tensor.get(k, "0"), 1, f"{k} of {said}")[0]) for k in names]
     xx, xy, xz, yy, yz, zz = values
     about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    # Drawings round, so that a thin plate may miss by its last digit.
+    # Files round, so a thin plate may violate the inequality in its last digit.
     least = np.linalg.eigvalsh(0.5 * np.trace(about) * np.eye(3) - about).min()
     if mass < 0 or least < -1e-2 * max(np.trace(about), 1e-9):
         raise ModelError(

@@ -1,6 +1,7 @@
 """The command `jaxid`: its help, its subcommands, its entry point."""
 
 import contextlib
+from importlib import metadata
 
 import typer
 
@@ -36,8 +37,23 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help=ABOUT,
 )
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"jaxid {metadata.version('jaxid-robotics')}")
+        raise typer.Exit
+
+
+@app.callback(help=ABOUT)
+def common(
+    version: bool = typer.Option(
+        False, "--version", callback=_show_version, is_eager=True, help="Print the version."
+    ),
+) -> None:
+    """Options of the command itself."""
+
 
 # In the order in which the help lists them.
 app.command()(inspect)

@@ -1,4 +1,4 @@
-"""What a controller sees and gives."""
+"""Base class of controllers, and their inputs."""
 
 import abc
 from collections.abc import Iterable
@@ -20,7 +20,7 @@ class Reading(eqx.Module):
 
 
 class Reference(eqx.Module):
-    """What the controller is asked for; every vector is `(joints,)`.
+    """The reference of the controller; every vector is `(joints,)`.
 
     `q`, `v`, `a`: the reference motion. `tau`: known torque added to the output, N·m or N.
     """
@@ -32,7 +32,7 @@ class Reference(eqx.Module):
 
 
 class Signals(eqx.Module):
-    """What a controller takes from a recording, sampled at its times, `(samples, joints)`."""
+    """Inputs of a controller from a recording, at its sample times, `(samples, joints)`."""
 
     q: Float[np.ndarray, "samples joints"]
     tau: Float[np.ndarray, "samples joints"]
@@ -47,13 +47,13 @@ class AbstractController(eqx.Module):
         return None
 
     def initial_state(self, reading: Reading) -> Float[Array, " states"]:
-        """Its own states before the first tick; none by default."""
+        """States of the law before the first tick; none by default."""
         return jnp.zeros(0)
 
     def derivative(
         self, reading: Reading, reference: Reference, state: Float[Array, " states"]
     ) -> Float[Array, " states"]:
-        """Rate of the states of a continuous law, per s."""
+        """Time derivative of the states of a continuous law, per s."""
         return jnp.zeros_like(state)
 
     def tick(
@@ -75,26 +75,26 @@ class AbstractController(eqx.Module):
     def acting(
         self, command: Float[Array, " joints"], state: Float[Array, " states"]
     ) -> Float[Array, " joints"]:
-        """What of the command acts now, `(joints,)`; all of it unless the loop has a delay."""
+        """The torque that acts now, `(joints,)`; the command unless the law has a delay."""
         return command
 
     @property
     def pace(self) -> float:
-        """How fast a law made up for the simulation is, 1/s, where steps must resolve it."""
+        """Bandwidth of a virtual law, 1/s, which integration must resolve; zero for others."""
         return 0.0
 
     @property
     def imposes(self) -> bool:
-        """Whether the reference is the motion, and the command the torque that it takes.
+        """Whether the motion is imposed: it is the reference, and torque is inverse dynamics.
 
-        Only a law that is made up for a simulation can do so.
+        Only a virtual law can do so.
         """
         return False
 
     def comparable(self, recording: Recording) -> float | None:
         """Frequency up to which measured and simulated torque may be compared, Hz; None for all.
 
-        Where it is given, both pass the same low-pass first, the ends of a recording do not count,
+        If there is one, both pass the same low-pass first, the ends of a recording are left out,
         and the loop starts on its reference.
         """
         return None
@@ -111,7 +111,7 @@ class AbstractController(eqx.Module):
         return None
 
     def settled(self, recordings: Iterable[Recording]) -> "AbstractController":
-        """The same with what it takes from the recordings that it is fitted to, for all others."""
+        """The controller with settings taken from the fitted recordings, for use on others."""
         return self
 
     def signals(self, recording: Recording) -> Signals:

@@ -1,4 +1,4 @@
-"""Whether computed torque on an uncertain model stays stable, proved by a matrix inequality.
+"""Stability of computed torque on an uncertain model, by a linear matrix inequality.
 
 Appendix B of Li, Peng and Juang 2023.
 """
@@ -17,14 +17,14 @@ from ..errors import ModelError, require
 from ..parameters import list_parameters, read_values, write_values
 from .computed_torque import Body, ComputedTorque
 
-# Added to the bound for what lies between the points at which it was computed.
+# Margin for points between those at which the bound was computed.
 _MARGIN = 1.02
 
 
 class MassError(eqx.Module):
     """A bound on the mass-matrix error M~ = M⁻¹ (M - M̂): M~ M~' ⪯ mu, `(joints, joints)`.
 
-    `worst` is the largest singular value of M~ that was met, `points` how many were looked at.
+    `worst` is the largest singular value of M~ found, `points` the number of points examined.
     """
 
     mu: Float[np.ndarray, "joints joints"]
@@ -66,8 +66,8 @@ def mass_error(
 ) -> MassError:
     """The mass-matrix error over the workspace, of arms whose parameters lie in a box.
 
-    Looked at in every corner of the box and at drawn points inside, at all poses; the smallest mu
-    by trace that holds them all, and 2 % for what lies between.
+    Computed in every corner of the box and at random points inside, at all poses. The bound is the
+    mu of smallest trace above all of them, plus 2 % for points between.
 
     **Arguments:**
 
@@ -127,19 +127,19 @@ def _smallest_above(
     problem.solve(solver=cvxpy.CLARABEL)
     found = np.asarray(mu.value)
     floor = 1e-9 * np.eye(n)
-    # Whatever the program left out is let in by scaling up.
+    # Scaled up to include what the program's tolerance left out.
     half = np.linalg.cholesky(found + floor)
     passed = np.linalg.solve(half, np.swapaxes(np.linalg.solve(half, squares), 1, 2))
     return max(1.0, float(np.linalg.eigvalsh(passed).max())) * (found + floor)
 
 
 class Certificate(eqx.Module):
-    """Whether the loop is proved stable, and by what.
+    """Result of a stability proof, with its certificate.
 
     The error dynamics x' = (A + B M~ K) x, x = (∫e, e, e') or (e, e') without integral gain, obey
     A'P + PA + epsilon P B mu B' P + K'K / epsilon + Q = 0 with P, Q positive definite, so that
-    x'Px falls for every M~ with M~ M~' ⪯ mu. It says nothing of disturbances, which the error
-    stays in proportion to, nor of sampling.
+    x'Px decreases for every M~ with M~ M~' ⪯ mu. The proof does not cover sampling. Disturbances
+    cause errors in proportion to their size.
 
     - `certified`: False is no proof of instability.
     - `reason`: a sentence.
@@ -193,7 +193,7 @@ def certify(law: ComputedTorque, error: MassError) -> Certificate:
         return Certificate(
             False, "these gains are unstable even on the exact model: raise Kd or Kp", error.mu
         )
-    # In units of the loop's own time constant all numbers are of the size of one.
+    # In units of the loop's time constant all numbers are of order one.
     order = len(A) // n
     w = float(np.exp(np.mean(np.log(np.abs(np.linalg.eigvals(A))))))
     scale = np.repeat(w ** -np.arange(order, dtype=float), n)
@@ -219,7 +219,7 @@ def _left(
     P: Float[np.ndarray, "states states"],
     epsilon: float,
 ) -> Float[np.ndarray, "states states"]:
-    """What is left for Q in the inequality, symmetric."""
+    """The matrix Q that the inequality leaves, symmetric."""
     A, B, K = error_dynamics(law)
     Q = -(A.T @ P + P @ A + epsilon * P @ B @ mu @ B.T @ P + K.T @ K / epsilon)
     return (Q + Q.T) / 2
@@ -232,7 +232,7 @@ def positive(matrix: Float[np.ndarray, "n n"]) -> bool:
 
 
 def holds(certificate: Certificate, law: ComputedTorque) -> bool:
-    """Whether P, Q and epsilon prove stability, by eigenvalues alone: no solver is trusted.
+    """Checks a certificate by eigenvalues alone, without relying on the solver.
 
     **Arguments:**
 
@@ -250,7 +250,7 @@ def holds(certificate: Certificate, law: ComputedTorque) -> bool:
 def _solve(
     A: np.ndarray, B: np.ndarray, K: np.ndarray, mu: np.ndarray
 ) -> tuple[np.ndarray, float] | None:
-    """P and epsilon of the inequality (107), with Q as far from zero as it can be."""
+    """P and epsilon of the inequality (107), with the smallest eigenvalue of Q maximised."""
     import scipy
 
     cvxpy = require("cvxpy", "sdp")

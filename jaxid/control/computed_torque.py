@@ -1,4 +1,4 @@
-"""Computed torque with a PID law on a model that is not quite the arm."""
+"""Computed torque with a PID law, on a model that may differ from the arm."""
 
 from typing import Protocol, runtime_checkable
 
@@ -13,7 +13,7 @@ from .pd import _vector
 
 @runtime_checkable
 class Body(Protocol):
-    """Equations of motion that a law may hold for the arm's."""
+    """Equations of motion inside a law."""
 
     def mass_matrix(self, q: Float[Array, " joints"]) -> Float[Array, "joints joints"]:
         """Inertia at q."""
@@ -22,7 +22,7 @@ class Body(Protocol):
     def bias(
         self, q: Float[Array, " joints"], v: Float[Array, " joints"]
     ) -> Float[Array, " joints"]:
-        """Torque besides that of the acceleration."""
+        """Torque besides that for acceleration."""
         ...
 
 
@@ -33,7 +33,7 @@ class ComputedTorque(AbstractController):
 
     **Arguments:**
 
-    - `model`: what the law takes the arm for.
+    - `model`: the model of the arm inside the law.
     - `Kp`, `Ki`, `Kd`: gains, `(joints,)`, 1/s², 1/s³ and 1/s.
     - `every`: period, s, of a law that computes with encoders alone: velocity is the difference
       of readings `window` ticks apart, and the torque holds until the next tick. None for a
@@ -54,7 +54,7 @@ class ComputedTorque(AbstractController):
         return self.every
 
     def initial_state(self, reading: Reading) -> Float[Array, " states"]:
-        """No integral; of a sampled law also no torque yet, and the last readings, newest first."""
+        """Zero integral; for a sampled law also zero torque and the last readings, newest first."""
         zero = jnp.zeros_like(reading.q)
         if self.every is None:
             return zero
@@ -70,7 +70,7 @@ class ComputedTorque(AbstractController):
     def derivative(
         self, reading: Reading, reference: Reference, state: Float[Array, " states"]
     ) -> Float[Array, " states"]:
-        """The error, of a continuous law."""
+        """Derivative of the integral of a continuous law: the error."""
         return jnp.zeros_like(state) if self.every else reference.q - reading.q
 
     def tick(
@@ -91,7 +91,7 @@ class ComputedTorque(AbstractController):
         state: Float[Array, " states"],
         mass: Float[Array, "joints joints"],
     ) -> Float[Array, " joints"]:
-        """The law's torque, `(joints,)`, N·m or N; of a sampled law the one that holds."""
+        """The law's torque, `(joints,)`, N·m or N; for a sampled law that of the last tick."""
         if self.every is None:
             return self._law(reading, reference, state)
         return jnp.split(state, 2 + self.window)[1]

@@ -1,4 +1,4 @@
-"""The recorded torque as input: no feedback at all."""
+"""The recorded torque as input, without feedback."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,7 +8,7 @@ from ._base import AbstractController, Reading, Reference, Signals
 
 
 class OpenLoop(AbstractController):
-    """The recorded torque drives the arm; what can be compared is the motion."""
+    """The recorded torque drives the arm; position is compared instead of torque."""
 
     def command(
         self,

@@ -24,7 +24,7 @@ class PID(AbstractController):
     Kd: Float[Array, " joints"] = eqx.field(converter=_vector)
 
     def initial_state(self, reading: Reading) -> Float[Array, " joints"]:
-        """The integral is empty, `(joints,)`."""
+        """Zero integral, `(joints,)`."""
         return jnp.zeros_like(reading.q)
 
     def derivative(

@@ -1,4 +1,4 @@
-"""Any continuous law as a drive computes it: at ticks, from encoders, late."""
+"""A continuous law as a drive computes it: at ticks, from encoders, with a delay."""
 
 from typing import Literal
 
@@ -16,20 +16,20 @@ from .pd import _vector
 class Sampled(AbstractController):
     """Another law, computed every `every` seconds and held in between.
 
-    Recorded torque is the command of the last tick; with a delay an earlier one acts. States of
-    the law, such as an integral, go by Euler's method from tick to tick.
+    The recorded torque is the command of the last tick; with a delay, an earlier one acts. States
+    of the law, such as an integral, are integrated from tick to tick by Euler's method.
 
     **Arguments:**
 
     - `law`: a continuous controller, with states or without.
     - `every`: period, s.
     - `delay`: how many periods later a command acts.
-    - `resolution`: of the encoders, rad or m, `(joints,)`; nil for exact readings. The rounding
-      has the derivative of the exact reading.
+    - `resolution`: of the encoders, rad or m, `(joints,)`; zero for exact readings. The
+      derivative of the rounding is taken as one.
     - `velocity`: `"measured"`, or the `"difference"` of readings `window` ticks apart.
     - `cutoff`: of a first-order low-pass on the velocity, Hz; None for none.
-    - `limit`: largest torque, `(joints,)`, N·m or N. States of a joint whose torque is at it stay
-      as they are (conditional integration, Åström and Hägglund 2006).
+    - `limit`: largest torque, `(joints,)`, N·m or N. States of a joint whose torque is at the
+      limit are held (conditional integration, Åström and Hägglund 2006).
     """
 
     law: AbstractController
@@ -45,7 +45,7 @@ class Sampled(AbstractController):
         if self.law.period is not None or self.law.pace > 0:
             raise ModelError(
                 f"Sampled holds a continuous law, and {type(self.law).__name__} is none: give the "
-                "law that the drive computes, as PD or PID"
+                "continuous law that the drive computes, such as PD or PID"
             )
         if self.every <= 0 or self.delay < 0 or self.window < 1:
             raise ModelError(
@@ -79,7 +79,7 @@ class Sampled(AbstractController):
     def _read(
         self, reading: Reading, past: list[Float[Array, " _"]], slow: list[Float[Array, " _"]]
     ) -> Reading:
-        """What the drive makes of the encoders."""
+        """Position and velocity as the drive computes them from its encoders."""
         fine = jnp.broadcast_to(self.resolution, reading.q.shape)
         step = jnp.where(fine > 0, fine, 1.0)
         rounded = jnp.where(fine > 0, step * jnp.round(reading.q / step), reading.q)
@@ -104,7 +104,7 @@ class Sampled(AbstractController):
         torque = self.law.command(seen, reference, after, identity)
         if own.shape[0]:
             full = jnp.abs(torque) > limit
-            # States that belong to joints stay alone; others stay where any joint is at its limit.
+            # States of joints are held one by one; other states where any joint is at its limit.
             stay = jnp.tile(full, own.shape[0] // n) if own.shape[0] % n == 0 else jnp.any(full)
             after = jnp.where(stay, own, after)
             torque = self.law.command(seen, reference, after, identity)

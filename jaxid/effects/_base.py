@@ -1,4 +1,4 @@
-"""What an effect may do, and where on the signal's way it may do it."""
+"""Base classes of effects: what an effect may change, and where in the loop."""
 
 import dataclasses
 import math
@@ -18,27 +18,28 @@ from ..errors import ModelError
 from ..parameters import Scalar, list_parameters, read_values, write_values
 from ._scene import Scene
 
-# Of no recording: effects that act on some by name do not act.
+# No recording: effects that act on named recordings do not act.
 NOBODY = 0
-# Added to a smoothing, rad/s or m/s: no division by zero at standstill, and at zero, its bound, the
-# derivative by it still says in which direction it does better.
+# Added to a smoothing, rad/s or m/s: avoids division by zero at standstill, and keeps the
+# derivative with respect to the smoothing useful at zero, its bound.
 _SHARP = 1e-30
-# Where a hyperbolic tangent is a half.
+# Argument at which a hyperbolic tangent is 1/2.
 _HALF = math.atanh(0.5)
 
 
 def recording_label(name: str) -> int:
-    """The number by which effects know a recording of that name (`Motion.label`)."""
+    """The number that stands for a recording's name in `Motion.label`."""
     return zlib.crc32(name.encode()) & 0x7FFFFFFF
 
 
 class Motion(eqx.Module):
-    """What an effect sees of the arm at one instant; every vector is `(joints,)`.
+    """State of the arm at one instant, the input of an effect; every vector is `(joints,)`.
 
-    `t` in s; `q`, `v`, `a` in rad or m and their derivatives; `tau` what the drives deliver, N·m
-    or N. `a` is zero where an effect neither is `inertial` nor `needs_acceleration`. For an effect
-    that is `loaded`, `tau` is what the other effects on the drives leave for the links. `state` is
-    the effect's own. `label` tells recordings apart (`recording_label`).
+    `t` in s; `q`, `v`, `a` in rad or m and their derivatives; `tau` is the torque that the
+    drives deliver, N·m or N. `a` is zero unless the effect is `inertial` or `needs_acceleration`.
+    For a `loaded` effect, `tau` is the torque that reaches the links after all other effects on
+    the drives. `state` holds the effect's own states. `label` identifies the recording
+    (`recording_label`).
     """
 
     t: Float[Array, ""]
@@ -51,26 +52,26 @@ class Motion(eqx.Module):
 
 
 class AbstractEffect(eqx.Module):
-    """One physical phenomenon. Override what it does; zero amplitude must be exactly absent.
+    """A physical effect. Override the methods that describe it; zero amplitude must mean absent.
 
-    `command` acts on the torque on its way through the drive, `torque` at the joint, `read` on
-    what the sensor reports. What lies between drive and link is an `AbstractTransmission`.
+    `command` changes the torque on its way through the drive, `torque` acts at the joint, `read`
+    changes the sensor's reading. Effects between drive and link are `AbstractTransmission`s.
 
     Class attributes, all False by default:
 
     - `inertial`: `torque` depends on acceleration and is affine in it.
-    - `needs_acceleration`: `torque` depends on acceleration in another way; it is given the
-      acceleration that there would be without it.
+    - `needs_acceleration`: `torque` depends on acceleration in another way; it gets the
+      acceleration of the arm without the effect.
     - `loaded`: `torque` depends on the torque that reaches the link.
-    - `finite`: it has no derivative at nothing, or one that says little of what it does: screened
-      by simulations with it.
-    - `on_link`: `torque` acts on the link, beyond what gives way between it and its drive.
-    - `joint_fields`: names of the fields that number joints, of an effect that depends on no other
-      joints and acts on no others: one program then serves all joints (none by default).
-    - `several`: one joint may have more than one of it, as it has two ends of its travel. Other
-      effects that are found twice on a joint come close to something else, and are no answer.
-    - `contact`: it parts and meets again, so that a shape held at a wrong value (how stiff it is)
-      leaves a fit in a wrong valley.
+    - `finite`: it has no derivative at zero amplitude, or one that does not predict its effect, so
+      it is screened by simulations with a finite amplitude.
+    - `on_link`: `torque` acts on the link, beyond an elastic transmission.
+    - `joint_fields`: names of the fields that are joint numbers, for an effect that depends and
+      acts on no other joints; one compiled program then serves all joints (none by default).
+    - `several`: a joint may have more than one of this effect, such as a stop at each end. If any
+      other effect is found twice on a joint, it approximates a different effect.
+    - `contact`: parts separate and touch again. A fit with a wrong stiffness then converges to a
+      wrong minimum, so the stiffness is estimated as well.
     """
 
     inertial: ClassVar[bool] = False
@@ -84,19 +85,19 @@ class AbstractEffect(eqx.Module):
 
     @classmethod
     def effect_name(cls) -> str:
-        """Its name in tables: the class's in lower case with underscores."""
+        """Name in tables: the class name in lower case with underscores."""
         return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
 
     @classmethod
     def spoken(cls) -> str:
-        """Its name in a sentence: that in tables, in words."""
+        """Name in a sentence."""
         return cls.effect_name().replace("_", " ")
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["AbstractEffect"]:
         """Instances to screen, at zero amplitude: every joint, and a grid of shapes if it has any.
 
-        Of effects in whose parameters nothing is linear: instances at a small finite setting.
+        Effects without a linear parameter give instances at a small finite setting.
         """
         fields = {field.name for field in dataclasses.fields(cls)}
         if "joint" not in fields:
@@ -105,50 +106,50 @@ class AbstractEffect(eqx.Module):
 
     @classmethod
     def fields_of_format(cls, fields: dict[str, Any], written: int) -> dict[str, Any]:
-        """Fields of a saved effect of an older format: a smoothing was given by one over it."""
+        """Converts fields of an older file format, which stored the inverse of a smoothing."""
         if written > 2 or "gamma" not in fields:
             return fields
         kept = {name: value for name, value in fields.items() if name != "gamma"}
         return {**kept, "smoothing": 1 / fields["gamma"]}
 
     def scaled(self, factor: float) -> "AbstractEffect":
-        """The effect at another size, where a finite setting was screened.
+        """The effect scaled by a factor, for effects screened at a finite setting.
 
-        By default what it is linear in, times the factor.
+        By default scales the parameters in which torque is linear.
         """
         linear = [p for p in list_parameters(self) if p.declaration.free and p.declaration.linear]
         return write_values(self, linear, factor * read_values(self, linear)) if linear else self
 
     def initial_state(self) -> Float[Array, " states"]:
-        """Its own states at rest; none by default."""
+        """States of the effect at rest; none by default."""
         return jnp.zeros(0)
 
     def settled(self, motion: Motion) -> Float[Array, " states"]:
-        """Its own states when a recording starts; at rest unless the first torque says more."""
+        """States at the start of a recording; those at rest by default."""
         return self.initial_state()
 
     def derivative(self, motion: Motion) -> Float[Array, " states"]:
-        """Rate of its own states, per s."""
+        """Time derivative of the effect's states, per s."""
         return jnp.zeros_like(motion.state)
 
     def command(self, motion: Motion) -> Float[Array, " joints"]:
-        """What becomes of the drive's torque `motion.tau`, `(joints,)`."""
+        """The drive's torque `motion.tau` as changed by the effect, `(joints,)`."""
         return motion.tau
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
-        """What it asks of the drives on top of the rigid arm, `(joints,)`; friction opposes."""
+        """Torque needed in addition to the rigid arm's, `(joints,)`; friction has the sign of v."""
         return jnp.zeros_like(motion.v)
 
     def read(self, q: Float[Array, " joints"]) -> Float[Array, " joints"]:
-        """What the sensor reports at position q, `(joints,)`."""
+        """Reading of the sensor at position q, `(joints,)`."""
         return q
 
 
 class AbstractTransmission(AbstractEffect):
-    """Something that gives way between drive and link of one joint (Spong 1987).
+    """Base class of compliance between drive and link of one joint (Spong 1987).
 
-    The drive keeps the inertia `rotor`; the sensor and the friction sit on the drive. The twist
-    (link minus drive) and its rate are the effect's states.
+    The drive has the inertia `rotor`; sensor and friction are on the drive's side. The states are
+    the twist (link minus drive) and its rate.
     """
 
     joint: eqx.AbstractVar[int]
@@ -160,7 +161,7 @@ class AbstractTransmission(AbstractEffect):
         return jnp.zeros(2)
 
     def after(self, other: "AbstractTransmission", load: float) -> "AbstractTransmission | None":
-        """At values that come close to another that was fitted; None where it knows of none.
+        """The effect at values similar to another fitted transmission; None if there are none.
 
         **Arguments:**
 
@@ -169,16 +170,16 @@ class AbstractTransmission(AbstractEffect):
         return None
 
     def present(self) -> Bool[Array, ""]:
-        """Whether it gives way at all; where not, drive and link move as one."""
+        """Whether it is compliant; otherwise drive and link move together."""
         return jnp.asarray(True)
 
     def through(self, twist: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
-        """Torque that the drive passes on to the link at this twist (rad) and rate (rad/s)."""
+        """Torque from drive to link at this twist (rad) and rate (rad/s)."""
         raise NotImplementedError
 
 
 def check_declared(effect: AbstractEffect, joints: int) -> None:
-    """Raises `ModelError` where a torque uses an acceleration that it would not be given.
+    """Raises `ModelError` where a torque uses an acceleration that it does not get.
 
     **Arguments:**
 
@@ -201,7 +202,7 @@ def check_declared(effect: AbstractEffect, joints: int) -> None:
 def _uses_acceleration(
     structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...], rest: Any, joints: int
 ) -> bool:
-    """Whether a torque depends on motion.a: traced once for all effects of a kind."""
+    """Whether a torque depends on motion.a; traced once for each class of effect."""
 
     def torque(leaves: list[Array], a: Float[Array, " joints"]) -> Float[Array, " joints"]:
         effect = eqx.combine(jax.tree.unflatten(structure, leaves), rest)
@@ -225,15 +226,15 @@ def smooth_sign(
     smoothing: Float[Array, "..."],
     form: Float[Array, "..."] | None = None,
 ) -> Float[Array, "..."]:
-    """The sign of a velocity made differentiable: 2/pi · arctan(v / smoothing).
+    """A differentiable sign of a velocity: 2/pi · arctan(v / smoothing).
 
     **Arguments:**
 
-    - `v`: rad/s or m/s. `smoothing`: the speed at which it is a half, 1/gamma of Brunot et al.
-      2016; at zero it is the sign itself.
-    - `form`: how soon it comes near the sign beyond that speed: 0 for the arctan, 1/2 for
-      x / sqrt(3 + x²), 1 for a hyperbolic tangent, each a half at the same speed, and between these
-      their parabola, which is above one by two thousandths at the most.
+    - `v`: rad/s or m/s. `smoothing`: the speed at which the result is 1/2, which is 1/gamma of
+      Brunot et al. 2016; zero gives the sign itself.
+    - `form`: shape of the function, which is 1/2 at the same speed for all: 0 for the arctan, 1/2
+      for x / sqrt(3 + x²), 1 for the hyperbolic tangent, and parabolic interpolation between
+      these, which exceeds one by at most 0.002.
     """
     x = v / (smoothing + _SHARP)
     slow = 2 / jnp.pi * jnp.arctan(x)

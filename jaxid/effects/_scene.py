@@ -1,4 +1,4 @@
-"""What screening knows of the recordings, so that an effect can propose settings worth trying."""
+"""Properties of the recordings from which effects choose settings to screen."""
 
 import equinox as eqx
 import numpy as np
@@ -6,16 +6,16 @@ from jaxtyping import Float
 
 
 class Scene(eqx.Module):
-    """Ranges of the recorded motion, one value a joint, in SI units.
+    """Ranges of the recorded motion, one value for each joint, in SI units.
 
     - `q_low`, `q_high`: range of position. `speed`, `torque`: largest magnitudes.
-    - `inertia`: what a joint feels while the others are free, averaged. `smoothing`: of the sign in
-      its Coulomb friction.
+    - `inertia`: mean inertia of a joint while the others are free. `smoothing`: of the sign in its
+      Coulomb friction.
     - `period`, `duration`: of the recordings, s. `recordings`: their names.
-    - `tones`: frequencies that stand out of the residual's spectrum, Hz.
+    - `tones`: frequencies of peaks in the residual's spectrum, Hz.
     - `lengths`: of the links before the last, m; `g`: gravity in their plane, m/s².
     - `slides`: whether a joint slides. `planar`: whether links move in one plane.
-    - `couplings`: pairs of joints whose speeds a shaft may add, and its turns for one of the first.
+    - `couplings`: pairs of joints that may share a shaft, and its turns for one of the first joint.
     - `moments`: first moments of each link in its own frame, kg·m; None where not known.
     """
 
@@ -46,5 +46,5 @@ class Scene(eqx.Module):
         return float(self.q_high[joint - 1] - self.q_low[joint - 1])
 
     def smoothed(self, joint: int) -> float:
-        """Speed at which the sign function of a joint is a half, rad/s or m/s."""
+        """Speed at which the smoothed sign of a joint is 1/2, rad/s or m/s."""
         return float(self.smoothing[joint - 1])

@@ -1,4 +1,4 @@
-"""What carries a part of an arm's weight: a cylinder or a spring between two links."""
+"""Counterbalance: a cylinder or a spring between two links that carries weight."""
 
 from collections.abc import Iterable
 
@@ -15,14 +15,13 @@ from ._scene import Scene
 class Counterbalance(AbstractEffect):
     """A cylinder between two links: T sin(q - qc) / l, with l² = 1 + r² - 2 r cos(q - qc).
 
-    A constant force between a point of the link before and one of the joint's own link, whose
-    distances from the axis are as one to r (hydro-pneumatic balancers of large arms; Weigand et al.
-    2021). It has no lever arm at qc, where the two points are nearest. With r = 0 it is a
-    counterweight.
+    A constant force between a point of the previous link and one of the joint's own link. The ratio
+    of their distances from the axis is r (hydro-pneumatic balancers of large arms; Weigand et al.
+    2021). The lever arm is zero at qc, where the points are nearest. r = 0 is a counterweight.
 
     **Arguments:**
 
-    - `joint`: about whose axis it turns.
+    - `joint`: on which it acts.
     - `level`: force times the shorter distance, N·m. `angle`: qc, rad. `ratio`: r, below one.
     """
 
@@ -39,7 +38,7 @@ class Counterbalance(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Counterbalance"]:
-        """Joints that turn an arm in space; angles half the way round, for the sign is free."""
+        """Turning joints of an arm in space; angles over half a turn, since the sign is free."""
         if scene.planar:
             return []
         angles = np.arange(8) * np.pi / 8 - np.pi / 2

@@ -1,4 +1,4 @@
-"""What two joints share: a shaft of the drive that turns with both."""
+"""Coupling of two joints by a shaft of the drive that turns with both."""
 
 from collections.abc import Iterable
 
@@ -13,11 +13,11 @@ from .friction import smoothing_speed
 
 
 class SharedShaft(AbstractEffect):
-    """Friction and inertia of a shaft that turns with a joint and with the next one it drives.
+    """Friction and inertia of a shaft that turns with one joint and drives the next.
 
-    The motor of a wrist's last joint often reaches it through the joint before, and turns with
+    The motor of a wrist's last joint often drives it through the previous joint, and turns with
     w = share v_i + v_j. Its friction Fv w + Fc sigma(w) and inertia I w' load both joints
-    (as FIGAROH has it for a Stäubli TX40).
+    (as in FIGAROH's model of a Stäubli TX40).
 
     **Arguments:**
 
@@ -37,14 +37,14 @@ class SharedShaft(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["SharedShaft"]:
-        """The pairs that gears couple, or may couple."""
+        """The pairs of joints that gears couple, or may couple."""
         return [
             cls(joint=i, driven=j, share=share, smoothing=scene.smoothed(j))
             for i, j, share in scene.couplings
         ]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
-        """What the shaft asks of both joints, `(joints,)`."""
+        """Torque of the shaft on both joints, `(joints,)`."""
         way = jnp.zeros_like(motion.v).at[self.joint - 1].set(self.share)
         way = way.at[self.driven - 1].add(1.0)
         speed, rate = way @ motion.v, way @ motion.a

@@ -1,4 +1,4 @@
-"""The hypothesis that assumes nothing: a free-form spline of one coordinate."""
+"""A free-form spline of one coordinate, which assumes no physical formula."""
 
 from typing import Literal
 
@@ -21,7 +21,7 @@ class Curve(AbstractEffect):
 
     - `joint`: on which the torque acts. `coordinate`: position `"q"`, velocity `"v"`,
       acceleration `"a"`, torque `"tau"` (of `of`) or time `"t"`.
-    - `signed`: times the sign of this joint's velocity, as friction.
+    - `signed`: whether to multiply by the sign of this joint's velocity, as for friction.
     """
 
     joint_fields = ("joint", "of")
@@ -74,7 +74,7 @@ def cubic_bump(d: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def curve_over(values: Float[np.ndarray, " samples"]) -> tuple[float, float]:
-    """Ends of a curve over recorded values of a coordinate: all but a thousandth at each end."""
+    """Range of a curve over recorded values, without 0.1 % of them at each end."""
     low, high = np.quantile(values, [0.001, 0.999])
     width = max(float(high - low), 1e-9)
     return float(low) - 1e-3 * width, float(high) + 1e-3 * width

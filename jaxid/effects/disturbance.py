@@ -1,4 +1,4 @@
-"""Torque that comes from outside at its own time."""
+"""Periodic torque from outside the robot."""
 
 from collections.abc import Iterable
 
@@ -24,7 +24,7 @@ class PeriodicDisturbance(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["PeriodicDisturbance"]:
-        """The frequencies that stand out of the residual's spectrum, on each joint."""
+        """Frequencies of peaks in the residual's spectrum, on each joint."""
         return [cls(joint=j, frequency=f) for j in scene.joints for f in scene.tones[j - 1]]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:

@@ -1,4 +1,4 @@
-"""What happens to a torque between command and joint: gain, lag, delay, saturation."""
+"""Effects between commanded torque and joint: gain, lag, delay, saturation."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -13,14 +13,14 @@ from ._scene import Scene
 
 
 class DriveGain(AbstractEffect):
-    """A wrong torque constant of one drive: it delivers (1 + g) times the command."""
+    """Wrong torque constant of one drive, which delivers (1 + g) times the command."""
 
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     gain: Scalar = parameter(0.0, symbol="gain", unit="1", lower=-0.9, scale=0.1)
 
     def command(self, motion: Motion) -> Float[Array, " joints"]:
-        """The command, one joint's multiplied, `(joints,)`."""
+        """The command with one joint's torque scaled, `(joints,)`."""
         return motion.tau.at[self.joint - 1].multiply(1 + self.gain)
 
 
@@ -35,7 +35,7 @@ class ActuatorLag(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["ActuatorLag"]:
-        """One small lag a joint: how large it is shows in the refit."""
+        """One small lag for each joint; its size is estimated in the refit."""
         return [cls(joint=j, time_constant=scene.period) for j in scene.joints]
 
     def scaled(self, factor: float) -> "ActuatorLag":
@@ -43,7 +43,7 @@ class ActuatorLag(AbstractEffect):
         return dataclasses.replace(self, time_constant=self.time_constant * factor)
 
     def initial_state(self) -> Float[Array, " states"]:
-        """No torque yet, `(1,)`."""
+        """Zero torque, `(1,)`."""
         return jnp.zeros(1)
 
     def settled(self, motion: Motion) -> Float[Array, " states"]:
@@ -65,8 +65,8 @@ class ActuatorLag(AbstractEffect):
 class TimeDelay(AbstractEffect):
     """Dead time between command and torque, by Padé's approximant of orders 4 and 5.
 
-    Off by 2.2e-9 (frequency times delay)^10, which for 30 ms is 1e-4 at 15 Hz; what arrives has no
-    part that arrives at once.
+    Its error is 2.2e-9 (2 pi frequency times delay)^10, 1e-4 at 15 Hz for 30 ms. No part of the
+    command arrives without delay.
     """
 
     joint_fields = ("joint",)
@@ -75,7 +75,7 @@ class TimeDelay(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["TimeDelay"]:
-        """One small delay a joint: how large it is shows in the refit."""
+        """One small delay for each joint; its size is estimated in the refit."""
         return [cls(joint=j, delay=scene.period) for j in scene.joints]
 
     def scaled(self, factor: float) -> "TimeDelay":
@@ -83,7 +83,7 @@ class TimeDelay(AbstractEffect):
         return dataclasses.replace(self, delay=self.delay * factor)
 
     def initial_state(self) -> Float[Array, " states"]:
-        """Nothing on its way, `(5,)`."""
+        """Zero torque in transit, `(5,)`."""
         return jnp.zeros(5)
 
     def settled(self, motion: Motion) -> Float[Array, " states"]:
@@ -107,7 +107,7 @@ class TimeDelay(AbstractEffect):
 
 
 class TorqueSaturation(AbstractEffect):
-    """The drive's limit: torque beyond it is cut off."""
+    """Torque limit of the drive; larger commands are cut off."""
 
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
@@ -118,9 +118,9 @@ class TorqueSaturation(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["TorqueSaturation"]:
-        """Limits from next to the largest torque down to a half of it.
+        """Limits from just below the largest torque down to half of it.
 
-        Far into its limit a loop makes another motion, from which a refit hardly finds back.
+        With a lower limit the simulated motion differs so much that a refit does not converge.
         """
         return [
             cls(joint=j, limit=share * scene.torque[j - 1])

@@ -14,9 +14,9 @@ from ._scene import Scene
 
 
 def smoothing_speed() -> Any:
-    """The field for the speed at which a smoothed sign is a half, 1/100 rad/s (Brunot et al. 2016).
+    """A field for the speed at which a smoothed sign is 1/2; 1/100 rad/s (Brunot et al. 2016).
 
-    Friction sharper than the samples can tell ends at zero, its bound.
+    Its estimate is zero, the bound, if friction changes sign faster than the samples resolve.
     """
     return parameter(
         0.01, symbol="eps", unit="rad/s", lower=0.0, scale=0.01, free=False, linear=False
@@ -24,7 +24,7 @@ def smoothing_speed() -> Any:
 
 
 class Viscous(AbstractEffect):
-    """Friction in proportion to speed: Fv v."""
+    """Friction proportional to velocity: Fv v."""
 
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
@@ -38,8 +38,8 @@ class Viscous(AbstractEffect):
 class Coulomb(AbstractEffect):
     """Dry friction, smoothed: Fc sigma(v), sigma = 2/pi arctan(v/eps) (Brunot et al. 2016).
 
-    `form` leads from the arctan at 0 over (v/eps) / sqrt(3 + (v/eps)²) at 1/2 to
-    tanh(v/eps · artanh(1/2)) at 1, which reach the sign's value sooner; with each, sigma is a half
+    `form` selects the function: the arctan at 0, (v/eps) / sqrt(3 + (v/eps)²) at 1/2, and
+    tanh(v/eps · artanh(1/2)) at 1, which approaches the sign fastest. For all of them sigma is 1/2
     at v = eps.
     """
 
@@ -58,7 +58,7 @@ class Coulomb(AbstractEffect):
 
 
 class Stribeck(AbstractEffect):
-    """Friction that falls with speed: Fs exp(-(v/vs)²) sigma(v) (Armstrong-Hélouvry 1991)."""
+    """Friction that decreases with speed: Fs exp(-(v/vs)²) sigma(v) (Armstrong-Hélouvry 1991)."""
 
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
@@ -70,7 +70,7 @@ class Stribeck(AbstractEffect):
 
     @classmethod
     def spoken(cls) -> str:
-        """Stribeck friction, after whom it is called."""
+        """Name in a sentence, with a capital."""
         return "Stribeck friction"
 
     @classmethod
@@ -93,7 +93,7 @@ class Stribeck(AbstractEffect):
 class AsymmetricFriction(AbstractEffect):
     """Friction that differs by direction: (dFv v + dFc sigma(v)) sigma(v) (Janot et al. 2017).
 
-    Forward it adds dFv to viscous and dFc to Coulomb friction, backward it takes them off.
+    dFv and dFc are added to viscous and Coulomb friction forward and subtracted backward.
     """
 
     joint_fields = ("joint",)

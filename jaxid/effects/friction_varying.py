@@ -16,8 +16,8 @@ from .friction import smoothing_speed
 class LoadDependentFriction(AbstractEffect):
     """Coulomb friction that grows with the transmitted torque: alpha |tau_link| sigma(v).
 
-    (Hamon, Gautier, Garrec 2010.) What reaches the link obeys
-    tau_link = tau - alpha |tau_link| sigma(v), which is solved here.
+    The torque that reaches the link obeys tau_link = tau - alpha |tau_link| sigma(v), which is
+    solved in closed form (Hamon, Gautier, Garrec 2010).
     """
 
     joint_fields = ("joint",)
@@ -43,8 +43,8 @@ class LoadDependentFriction(AbstractEffect):
 class PositionDependentFriction(AbstractEffect):
     """Friction that varies with the angle, once and twice a turn (bent shafts, worn gears).
 
-    (A1 cos q + B1 sin q + A2 cos 2q + B2 sin 2q) sigma(v). A joint that slides counts its travel
-    as half a turn, so that friction may rise from one end to the other.
+    (A1 cos q + B1 sin q + A2 cos 2q + B2 sin 2q) sigma(v). For a sliding joint its travel is
+    half a turn, so that friction may rise from one end to the other.
     """
 
     joint_fields = ("joint",)
@@ -163,12 +163,12 @@ class LuGre(AbstractEffect):
 
     @classmethod
     def effect_name(cls) -> str:
-        """Hysteresis, of which it is one form."""
+        """`hysteresis`, of which it is one form."""
         return "hysteresis"
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["LuGre"]:
-        """Distances as for Dahl's form, with a middling Stribeck velocity."""
+        """Distances as for Dahl's form, with one medium Stribeck velocity."""
         return [
             cls(joint=j, slide=share * scene.travel(j), velocity=0.15 * scene.speed[j - 1])
             for j in scene.joints

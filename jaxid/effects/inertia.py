@@ -1,4 +1,4 @@
-"""Inertia that the base parameters do not hold."""
+"""Inertia that is not part of the base parameters."""
 
 from collections.abc import Iterable
 
@@ -22,7 +22,7 @@ class RotorInertia(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["RotorInertia"]:
-        """Joint 2 and further: the first joint's is part of its base inertia."""
+        """Joints from 2 on: that of the first joint is part of its base inertia."""
         return [cls(joint=j) for j in scene.joints if j > 1]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
@@ -49,9 +49,9 @@ class Payload(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Payload"]:
-        """Each recording in turn: on all of them it cannot be told from the link's own mass.
+        """One recording at a time: on all of them it is the same as the link's own mass.
 
-        Of arms that turn, only with known lengths of links; of arms that turn and slide, none.
+        For turning joints the link lengths must be known; arms with both kinds of joints give none.
         """
         slides = all(scene.slides)
         known = slides or len(scene.lengths) == len(scene.slides) - 1
@@ -70,7 +70,7 @@ class Payload(AbstractEffect):
         ]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
-        """What it takes to carry the mass along, `(joints,)`."""
+        """Torque that moves the mass, `(joints,)`."""
         if self.slides:
             asked = self.mass * motion.a
         else:
@@ -90,7 +90,7 @@ class Payload(AbstractEffect):
         return jax.jacfwd(self._place)(q)
 
     def _lift(self, motion: Motion) -> Float[Array, " two"]:
-        """Acceleration of the mass, gravity taken off."""
+        """Acceleration of the mass minus gravity."""
 
         def velocity(q: Float[Array, " joints"]) -> Float[Array, " two"]:
             return jax.jvp(self._place, (q,), (motion.v,))[1]

@@ -26,7 +26,7 @@ class TorqueRipple(AbstractEffect):
     def screened(cls, scene: Scene) -> Iterable["TorqueRipple"]:
         """Harmonics up to thirty waves over the travel, a third of a wave apart.
 
-        Below one and a half waves ripple is a bend like any other, and is left to springs.
+        With less than one and a half waves over the travel, ripple is not distinct from a spring.
         """
         return [
             cls(joint=j, harmonic=2 * np.pi * waves / scene.travel(j))
@@ -42,7 +42,7 @@ class TorqueRipple(AbstractEffect):
 
 
 class TorqueOffset(AbstractEffect):
-    """A constant torque at one joint: amplifier offset, a balance weight that is off."""
+    """A constant torque at one joint: amplifier offset, wrong balance weight."""
 
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
@@ -93,16 +93,16 @@ class EndStop(AbstractEffect):
         ]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
-        """The stop's push on the joint, `(joints,)`."""
+        """Torque of the stop on the joint, `(joints,)`."""
         beyond = jnp.maximum(self.side * (motion.q[self.joint - 1] - self.angle), 0.0)
         return on_joint(self.joint, self.side * self.stiffness * beyond, motion)
 
 
 class Gravity(AbstractEffect):
-    """A base that is not level, or gravity at all, on a planar arm of turning joints.
+    """Gravity on a planar arm of turning joints, such as that of a base that is not level.
 
     Every link adds G cos(phi) + H sin(phi), with phi its angle in the plane, to its own joint and
-    those before it.
+    all previous ones.
     """
 
     G: Vector = parameter((0.0, 0.0), symbol="G", unit="N·m", scale=0.1)
@@ -111,7 +111,7 @@ class Gravity(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Gravity"]:
-        """One, for arms that turn; on a sliding joint gravity is an offset."""
+        """One instance for arms that turn; on a sliding joint gravity is an offset."""
         if any(scene.slides) or not scene.planar:
             return []
         zeros = (0.0,) * len(scene.slides)
@@ -125,11 +125,12 @@ class Gravity(AbstractEffect):
 
 
 class Tilt(AbstractEffect):
-    """Gravity in the plane of an arm whose links' first moments are known but for the first's.
+    """Gravity in the plane of an arm whose first moments are known except for the first link's.
 
     Each link of moments (MX, MY) and angle phi in the plane adds
-    gx (MX sin phi + MY cos phi) - gy (MX cos phi - MY sin phi) to its own joint and those before;
-    the first link's moment lies along it. One parameter less than `Gravity`, of which it is a form.
+    gx (MX sin phi + MY cos phi) - gy (MX cos phi - MY sin phi) to its own joint and all
+    previous ones; the first link's moment is along the link. A form of `Gravity` with one parameter
+    less.
     """
 
     gx: Scalar = parameter(0.0, symbol="gx", unit="m/s²", scale=0.1)
@@ -140,12 +141,12 @@ class Tilt(AbstractEffect):
 
     @classmethod
     def effect_name(cls) -> str:
-        """Gravity, of which it is one form."""
+        """`gravity`, of which it is one form."""
         return "gravity"
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Tilt"]:
-        """First moments from that of the last link to sixteen times it, where it is not known."""
+        """First moments from one to sixteen times that of the last link, if it is not known."""
         known = [m for m in scene.moments if m is not None]
         flat = scene.planar and not any(scene.slides)
         if not flat or not known or None in scene.moments[1:]:

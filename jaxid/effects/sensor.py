@@ -1,4 +1,4 @@
-"""What the sensor gets wrong."""
+"""Sensor errors."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from ._base import AbstractEffect
 
 
 class EncoderEccentricity(AbstractEffect):
-    """An encoder disc off its centre: q is read as q + A sin q + B cos q."""
+    """Eccentric encoder disc: q is read as q + A sin q + B cos q."""
 
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)

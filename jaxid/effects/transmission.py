@@ -1,4 +1,4 @@
-"""What gives way between drive and link: elasticity, backlash."""
+"""Compliance between drive and link: elasticity, backlash."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -16,8 +16,8 @@ from ._scene import Scene
 class JointElasticity(AbstractTransmission):
     """A compliant transmission: torque (drive - link) / compliance, slightly damped (Spong 1987).
 
-    `rotor` is the part of the joint's inertia that sits on the drive; `damping` the time by which
-    the torque runs ahead, s.
+    `rotor` is the part of the joint's inertia on the drive's side; `damping` is the ratio of
+    damping to stiffness, s.
     """
 
     joint: int = eqx.field(static=True)
@@ -45,11 +45,11 @@ class JointElasticity(AbstractTransmission):
         return dataclasses.replace(self, compliance=self.compliance * factor)
 
     def present(self) -> Bool[Array, ""]:
-        """Where there is compliance."""
+        """Whether the compliance is above zero."""
         return self.compliance > 0
 
     def through(self, twist: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
-        """Torque passed on, N·m."""
+        """Transmitted torque, N·m."""
         soft = jnp.where(self.compliance > 0, self.compliance, 1.0)
         return -(twist + self.damping * rate) / soft
 
@@ -58,8 +58,8 @@ class Backlash(AbstractTransmission):
     """A gap in the transmission, with stiff contact on both sides.
 
     `gap` is its whole width; `rotor` as for `JointElasticity`. In contact the torque is
-    kc depth (1 + dk rate), the rate counted into the contact (Hunt, Crossley 1975), so that it does
-    not jump where contact begins; stiffness and damping are given, not estimated.
+    kc depth (1 + dk rate), with the rate positive into the contact (Hunt, Crossley 1975), which is
+    continuous where contact begins. Stiffness and damping are held unless freed.
     """
 
     joint: int = eqx.field(static=True)
@@ -91,9 +91,9 @@ class Backlash(AbstractTransmission):
         return dataclasses.replace(self, gap=self.gap * factor)
 
     def after(self, other: AbstractTransmission, load: float) -> "Backlash | None":
-        """A contact as stiff as an elasticity, in a gap as wide as its twist to both sides.
+        """A contact with the stiffness of an elasticity, and a gap of its twist to both sides.
 
-        A contact that is much too stiff is a wall from behind which no refit finds back.
+        A refit does not converge from a contact that is much too stiff.
         """
         if not isinstance(other, JointElasticity):
             return None
@@ -101,11 +101,11 @@ class Backlash(AbstractTransmission):
         return dataclasses.replace(self, gap=gap, rotor=other.rotor, stiffness=stiffness)
 
     def present(self) -> Bool[Array, ""]:
-        """Where there is a gap."""
+        """Whether the gap is above zero."""
         return self.gap > 0
 
     def through(self, twist: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
-        """Torque passed on, N·m; nothing inside the gap."""
+        """Transmitted torque, N·m; zero inside the gap."""
         depth = jnp.maximum(jnp.abs(twist) - self.gap / 2, 0.0)
         side = jnp.sign(twist)
         grip = jnp.maximum(1 + self.damping * side * rate, 0.0)

@@ -1,4 +1,4 @@
-"""Methods, one a file, all through `fit(loop, recordings, method)`."""
+"""Estimation methods, one file each, called through `fit(loop, recordings, method)`."""
 
 from ._fit import fit as fit
 from .covariance import deviations as deviations

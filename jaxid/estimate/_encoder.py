@@ -1,4 +1,4 @@
-"""What encoder steps do to a regression: the covariance of its rows, and least squares with it."""
+"""Encoder quantisation in a regression: covariance of the rows, generalised least squares."""
 
 from collections.abc import Callable, Sequence
 
@@ -40,12 +40,12 @@ class LowRank(eqx.Module):
 def errors_of(
     recording: Recording, states: AbstractStates, kernels: Kernels, rows: slice, factor: int
 ) -> Stationary | LowRank:
-    """How white errors of the recorded position show in the rows of a regression.
+    """Covariance in the rows of a regression from white errors of the recorded position.
 
     **Arguments:**
 
-    - `states`: how velocities were had. `kernels`: what position becomes, through the states and
-      the regression's own filter.
+    - `states`: how velocities were estimated. `kernels`: impulse responses from position to the
+      rows, through the states and the regression's filter.
     - `rows`: which samples the rows are. `factor`: samples from one row to the next.
     """
     import scipy
@@ -98,11 +98,11 @@ def row_errors(
     resolution: Float[np.ndarray, " joints"],
     residual: Float[np.ndarray, "rows joints"],
 ) -> RowErrors:
-    """The whitening of one recording's rows: of encoder errors, and of what else is in them.
+    """Whitening of one recording's rows: encoder errors plus other white errors.
 
     To first order the error of a row is that of position, velocity and acceleration times the
-    torque's derivatives there. What the residual holds beyond it is taken as white, a variance a
-    joint.
+    torque's derivatives there. The rest of the residual is treated as white, with one
+    variance for each joint.
 
     **Arguments:**
 
@@ -168,7 +168,7 @@ def _banded_whitening(
             lower = scipy.linalg.cholesky_banded(with_rest, lower=True)
             break
         except scipy.linalg.LinAlgError:
-            # Correlations cut at a millionth may leave it a shade indefinite.
+            # Truncated correlations may make it slightly indefinite.
             diagonal = 10 * diagonal
     else:
         raise FitError(

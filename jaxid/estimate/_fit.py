@@ -1,4 +1,4 @@
-"""The one door to every method."""
+"""`fit`, the entry point of all methods."""
 
 import dataclasses
 import math
@@ -57,24 +57,24 @@ def fit(
 
 
 def _check_rigid(loop: ClosedLoop, method: AbstractMethod) -> None:
-    """Refuses what stands between the sensors and the motion that a method takes from them."""
+    """Refuses effects because of which sensors do not show the motion that a method needs."""
     for effect in loop.effects:
         sensor = type(effect).read is not AbstractEffect.read
         if sensor or isinstance(effect, AbstractTransmission):
             raise FitError(
-                f"{type(method).__name__} takes what the sensors report for the motion of drive "
-                f"and link, which {effect.effect_name()} sets apart: use OEM, or leave it out"
+                f"{type(method).__name__} assumes that the sensors show the motion of drive and "
+                f"link, which differ with {effect.effect_name()}: use OEM, or leave it out"
             )
 
 
-# Chance of estimates of bodies that matter can have lying so far from all of them.
+# Probability that the estimate of physical bodies is so far from all of them.
 _CHANCE = 0.01
 
 
 def _matter(found: Fit) -> list[str]:
-    """What to say of base parameters of a serial arm that no bodies have.
+    """A note where the base parameters of a serial arm belong to no physical bodies.
 
-    It asks for the extra `sdp`; without it the mass matrix alone says what is not physical.
+    Needs the extra `sdp`; without it only the mass matrix is checked.
     """
     arm = found.loop.arm
     names = [p.names for p in found.loop.free_parameters if p.place == ("arm", "base")]
@@ -98,12 +98,12 @@ def _matter(found: Fit) -> list[str]:
     return [
         f"no bodies of positive mass have these base parameters: the nearest that do are "
         f"{nearest.distance:.3g} standard deviations away, most of all in {worst}, so an effect "
-        'that the model lacks may be hidden in them; bodies="drawn" lets it show'
+        'that the model lacks may be hidden in them; bodies="drawn" makes it visible'
     ]
 
 
 def _band(loop: ClosedLoop, recordings: Recordings) -> list[str]:
-    """What to say of torque that is compared in a part of its frequencies only."""
+    """A note where torque is compared below a frequency only."""
     cutoff = loop.controller.comparable(recordings[0])
     if cutoff is None:
         return []
@@ -111,19 +111,19 @@ def _band(loop: ClosedLoop, recordings: Recordings) -> list[str]:
 
 
 def _gaps(recordings: Recordings) -> list[str]:
-    """What to say of recordings with stretches of time in which nothing was recorded."""
+    """Notes on recordings with gaps."""
     return [
-        f"{r.name} has a gap of {np.diff(r.time).max():.3g} s, across which its reference was "
-        "taken for smooth and its noise for steady: cut it there with Recording.slice"
+        f"{r.name} has a gap of {np.diff(r.time).max():.3g} s, across which its reference is "
+        "assumed smooth and its noise stationary: cut it there with Recording.slice"
         for r in recordings
         if missing_after(r.time).any()
     ]
 
 
 def _honest(found: Fit) -> Fit:
-    """The fit, which does not call itself successful where a number is none.
+    """The fit, marked as failed if a number in it is NaN.
 
-    Infinite deviations are meant: those of what the recordings do not determine.
+    Infinite deviations are allowed: they belong to undetermined parameters.
     """
     numbers = {
         "values": np.where(np.isfinite(found.theta), found.theta, np.nan),
@@ -138,14 +138,14 @@ def _honest(found: Fit) -> Fit:
     return dataclasses.replace(found, status=Status.overflowed, notes=(*found.notes, note))
 
 
-# Models that describe a robot leave a few per cent, and noise seldom ten.
+# Good models leave a few per cent, and noise is rarely above ten.
 _DOUBTFUL_PERCENT = 30.0
 
 
 def _doubted(found: Fit) -> Fit:
-    """The fit, with what to look at where it leaves more of a signal than a model should.
+    """The fit, with a note where it leaves more of a signal than a good model.
 
-    It is no success where no signal is explained at all, or one is left larger than it was.
+    It is a misfit if no signal is explained, or if one is larger after the fit than before.
     """
     errors = found.error_percent * _of_motion(found)
     left = _left_percent(found, errors)
@@ -166,15 +166,15 @@ def _doubted(found: Fit) -> Fit:
 
 
 def _followed(found: Fit) -> Fit:
-    """The fit, with the joints whose recorded position has little to do with its reference.
+    """The fit, with a note on joints whose position does not follow the reference.
 
-    Simulations start from the reference, so that a torque may be explained whatever q says.
+    Simulations start from the reference, so torque may be explained although q is wrong.
     """
     pairs = [(r.q - r.q_ref, r.q_ref) for r in found.recordings if r.q_ref is not None]
     if not pairs:
         return found
     away, moved = (sum(np.var(x, axis=0) for x in both) for both in zip(*pairs, strict=True))
-    # A reference at rest has the spread of its rounding, and is not followed anywhere.
+    # A reference at rest varies by rounding only.
     still = moved < 1e-20 * max(float(np.mean(ref**2)) for _, ref in pairs)
     astray = np.flatnonzero(~still & (away > 0.8 * moved))
     if not astray.size:
@@ -185,9 +185,9 @@ def _followed(found: Fit) -> Fit:
 
 
 def _of_motion(found: Fit) -> Float[np.ndarray, "recordings joints"]:
-    """Size of the compared signal over that of what a model has to explain of it.
+    """Norm of the compared signal over the norm of its variation, which a model has to explain.
 
-    Where zero is on an axis says nothing of a model; of joints that hardly move there is no more.
+    The mean position does not count, except for joints that barely move.
     """
     shape = found.error_percent.shape
     if found.optimum is None or found.optimum.problem.signals[0] != "q":
@@ -198,7 +198,7 @@ def _of_motion(found: Fit) -> Float[np.ndarray, "recordings joints"]:
 
 
 def _left_percent(found: Fit, percent: "pd.DataFrame") -> Float[np.ndarray, " joints"]:
-    """Relative error of each joint over all recordings; of a signal that is nil there is none."""
+    """Relative error of each joint over all recordings; NaN for a signal that is zero."""
     errors = percent.to_numpy()
     left = np.array([np.linalg.norm(r, axis=0) for r in found.residuals])
     with np.errstate(divide="ignore", invalid="ignore"):

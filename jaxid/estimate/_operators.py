@@ -1,4 +1,4 @@
-"""Filters s^k F(s) that a whole regression passes, so that nothing has to be differentiated."""
+"""Filters s^k F(s) of a whole regression, which replace differentiation."""
 
 import itertools
 
@@ -49,7 +49,7 @@ class Operator(eqx.Module):
     ) -> Float[np.ndarray, "samples *axes"]:
         """s^k F(s) on samples, integrated exactly over each sample.
 
-        It starts as if the first sample had always been.
+        The initial state is the steady state of the first sample.
 
         **Arguments:**
 
@@ -100,11 +100,11 @@ class Operator(eqx.Module):
         return stages
 
     def transient(self, time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "samples poles"]:
-        """What any initial state leaves in the output: combinations of these columns."""
+        """Columns that span the response to any initial state."""
         t = time - time[0]
         columns, seen = [], []
         for pole in self.poles:
-            # Poles that all but coincide span what one pole and its derivative span.
+            # Nearly equal poles span the same space as one pole and its derivative.
             same = sum(abs(pole - other) < 1e-3 * pole for other in seen)
             columns.append((pole * t) ** same * np.exp(-pole * t))
             seen.append(pole)
@@ -112,10 +112,10 @@ class Operator(eqx.Module):
 
     @property
     def memory(self) -> int:
-        """Samples after which less than a millionth is left of a disturbance."""
+        """Samples after which a disturbance has decayed below 1e-6."""
         return int(np.ceil(18 / min(self.poles) / self.step))
 
     @property
     def factor(self) -> int:
-        """Decimation that keeps what passes: four samples to the fastest pole's period."""
+        """Decimation that keeps the pass band: four samples for each period of the fastest pole."""
         return max(1, int(2 * np.pi / max(self.poles) / self.step / 4))

@@ -1,4 +1,4 @@
-"""Regressions on position and velocity: the split, its filter, the estimate from its rows."""
+"""Regressions on position and velocity: split equations, filter, estimate."""
 
 import dataclasses
 import time
@@ -32,7 +32,7 @@ EncoderWeights = Literal["joint", "encoder"]
 
 
 class Rows(eqx.Module):
-    """The regression of one recording: equations, and what is needed to weigh them.
+    """The regression of one recording: equations and data for their weights.
 
     `states` say where its motion came from. `transient` holds columns that each joint's rows may
     contain besides, or None; `kernels` is what recorded positions become on their way into the
@@ -58,7 +58,7 @@ def as_motion(motion: Simulated, recording: Recording) -> Motion:
 
 
 def split_torque(loop: ClosedLoop, at: Motion, once: bool) -> Float[Array, "4 samples joints"]:
-    """What the motion takes less what the drives deliver, in parts that need no acceleration.
+    """Inverse dynamics minus delivered torque, in parts that need no acceleration.
 
     The parts are to be differentiated twice, once and not at all; the last is the torque that is
     delivered, with its sign. `once` moves the first part to the second, as its rate.
@@ -124,7 +124,7 @@ def split_rows(
 
     - `method`: whose name errors give.
     - `states`: where velocities come from. `operator`: with one pole or two.
-    - `transient`: what is done about the operator's unknown initial state.
+    - `transient`: how the operator's unknown initial state is treated.
 
     **Raises:** `FitError` where an effect needs an acceleration, or no rows are left.
     """
@@ -180,7 +180,7 @@ def motion_rows(loop: ClosedLoop, recording: Recording, states: AbstractStates) 
 
 
 def _without_transient(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and right-hand side, with what the transient could be taken out of each joint."""
+    """Columns and right-hand side, with the transient projected out of each joint."""
     if rows.transient is None:
         return rows.columns, rows.right
     basis, _ = np.linalg.qr(rows.transient)
@@ -198,7 +198,7 @@ def fit_rows(
     weights: EncoderWeights,
     rows_of: Callable[[Recording], Rows],
 ) -> Fit:
-    """Least squares on the rows of all recordings, weighted as asked.
+    """Weighted least squares on the rows of all recordings.
 
     **Arguments:**
 
@@ -213,7 +213,7 @@ def fit_rows(
         for recording in recordings:
             if recording.resolution is None:
                 raise FitError(
-                    f"{recording.name} does not say what one encoder count is: give resolution= "
+                    f"{recording.name} has no encoder resolution: give resolution= "
                     "when it is read, or use weights='joint'"
                 )
     # Operators, differences and series are those of even samples.
@@ -260,7 +260,7 @@ def _weighted(
     solved: Solved,
     names: tuple[str, ...],
 ) -> Solved:
-    """The solution with the covariance that a first one gives, twice."""
+    """The solution with the covariance from a previous one, iterated twice."""
     chosen = linear_parameters(loop)
     heard = [
         errors_of(recording, r.states, r.kernels, r.at, r.at.step)

@@ -1,4 +1,4 @@
-"""Output error minimised, with the weights and initial states that follow, until they settle."""
+"""Minimisation of output error, iterated over weights and initial states."""
 
 import dataclasses
 import math
@@ -44,7 +44,7 @@ class Converged(eqx.Module):
 
     @property
     def optimum(self) -> Optimum:
-        """Where it ended, for whatever asks how sure that is."""
+        """The optimum, from which deviations follow."""
         point = self.minimum.point
         return Optimum(self.problem, point.theta, point.start)
 
@@ -59,13 +59,13 @@ def converge(
     weights: Float[Array, " outputs"] | None = None,
     batch: Batch | None = None,
 ) -> Converged:
-    """Minimises, then again with the weights and initial states that follow, until they settle.
+    """Minimises repeatedly with updated weights and initial states, until they converge.
 
     **Arguments:**
 
     - `filters`: noise filter of each output; white noise where None.
-    - `deadline`: of `time.perf_counter`; past it, what there is is given.
-    - `weights`: to begin with, if they are about known; filters know theirs.
+    - `deadline`: of `time.perf_counter`; after it the best values so far are returned.
+    - `weights`: start values, if known; filters contain theirs.
     - `batch`: the pieces prepared, if they are already.
     """
     pieces = pieces_of(recordings, method.window)
@@ -77,7 +77,7 @@ def converge(
     start = jnp.asarray(np.concatenate([batch.q0, batch.v0], axis=1))
     if weights is None and filters is not None:
         weights = _weights_of(filters, first)
-    # The weight of a lone output is but its unit.
+    # The weight of a single output only scales the loss.
     alone = len(first) == 1
     # Until the weights are known, a rough minimum is enough.
     worth = 1e-4 if alone or weights is not None else 1e-2
@@ -101,10 +101,10 @@ def converge(
             break
         loop, start = loop.with_theta(minimum.point.theta), minimum.point.start
         new = _new_weights(minimum.point, problem, first)
-        # Estimates are flat in the weights: those that are a tenth off cost half a percent.
+        # Estimates depend little on the weights: an error of 10 % costs 0.5 % of precision.
         floor = bool(np.all(np.asarray(new) > 0.99 / _FLOOR * np.asarray(first)))
         if minimum.status is Status.stalled and floor:
-            # Only rounding is left, in which no step finds less.
+            # The residual is at rounding level, and no step lowers it.
             minimum = dataclasses.replace(minimum, status=Status.converged)
         settled = bool(np.all(np.abs(np.asarray(new) / np.asarray(weights) - 1) < 0.1))
         ended = total >= method.max_steps or minimum.status is Status.max_seconds
@@ -130,7 +130,7 @@ def converge(
 
 
 def _weights_of(filters: Noise, first: Float[Array, " outputs"]) -> Float[Array, " outputs"]:
-    """One over the deviation of what each filter leaves, with a floor of the signal's size."""
+    """Inverse deviation of each filter's innovations, with a floor relative to the signal."""
     if isinstance(filters, VectorAR):
         variance = np.diag(filters.covariance)
     else:
@@ -151,7 +151,7 @@ def _taps(filters: Noise, weights: Float[Array, " outputs"]) -> Float[np.ndarray
 
 
 def _mix(filters: Noise, weights: Float[Array, " outputs"]) -> Float[Array, "..."] | None:
-    """What makes the innovations of a vector filter white; other filters' are taken for it."""
+    """The matrix that whitens the innovations of a vector filter; None for other filters."""
     if not isinstance(filters, VectorAR):
         return None
     w = np.asarray(weights)
@@ -164,16 +164,16 @@ def _new_weights(
 ) -> Float[Array, " outputs"]:
     """One over each output's residual deviation; recorded noise-free outputs keep a floor.
 
-    The floor is of the signal's size: one of the present weights would rise from round to round.
+    The floor is relative to the signal: relative to the present weights it would rise each round.
     """
     residual, now = np.asarray(point.found.residual), np.asarray(problem.weights)
-    # Rows at which a joint stands still are zero, and none that count.
+    # Rows at which a joint stands still are zero and do not count.
     samples = np.maximum(np.count_nonzero(residual, axis=(0, 1)), 1)
     spread = np.sqrt(np.einsum("rko,rko->o", residual, residual) / samples) / now
     return jnp.asarray(1 / np.maximum(spread, _FLOOR / np.asarray(first)))
 
 
-# Share of a tenth of a signal below which its residual is rounding.
+# Residuals below this share of a tenth of the signal are rounding.
 _FLOOR = 1e-10
 
 
@@ -184,7 +184,7 @@ def finer_substeps(done: Converged) -> int | None:
     if isinstance(done.loop.controller, OpenLoop):
         return None
     now, batch = done.loop.stepping.substeps or 1, done.batch
-    # A few recordings fit the program that there is already; of many one says enough.
+    # A few recordings fit the compiled program; of many recordings, one is enough.
     if len(done.pieces) > 4:
         shortest = int(np.argmin([piece.samples for piece in done.pieces]))
         batch = taken(batch, np.array([shortest]))
@@ -204,17 +204,17 @@ def finer_substeps(done: Converged) -> int | None:
 def from_best_starts(
     method: OutputErrorSettings, loop: ClosedLoop, recordings: Sequence[Recording], batch: Batch
 ) -> Batch:
-    """The batch with initial states at which the loop does best, where the method estimates them.
+    """The batch with the best initial states for the loop, where the method estimates them.
 
-    A recording that starts in motion, or that sensors which are off set in motion at once, tells
-    its first velocity badly; a fit estimates it, and what is held against a fit must as well.
+    A recording that starts in motion determines its first velocity badly, as does one with a sensor
+    error. A fit estimates the initial state, so a comparison with a fit must do the same.
     """
     signals, free = compared_signals(method, loop), estimated_starts(method, recordings, batch)
     if not free.any():
         return batch
     weights = jnp.asarray(first_weights(loop, tuple(recordings), signals))
     noise = jnp.asarray(_taps(None, weights))
-    # Parameters stay where they are: between bounds that leave them no room.
+    # Equal bounds hold the parameters at their values.
     at, own = loop.theta, jnp.asarray(free)
     problem = Problem(loop, batch, weights, noise, own, at, at, signals, True)
     start = jnp.concatenate([batch.q0, batch.v0], axis=1)

@@ -1,4 +1,4 @@
-"""How sure a least-squares estimate is: equation (A.1), a sandwich, and the paper's own numbers."""
+"""Covariance of a least-squares estimate: equation (A.1), sandwich, and the paper's formula."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ SAID = {
 
 
 class Optimum(eqx.Module):
-    """Where a least-squares fit ended, so that it can be linearised again.
+    """The optimum of a least-squares fit, which can be linearised again.
 
     - `problem`: what was minimised; `theta`: its parameters, those of a noise filter last;
       `start`: initial states.
@@ -42,7 +42,7 @@ class Optimum(eqx.Module):
 
 
 class Reduced(eqx.Module):
-    """Residuals and derivatives by recording, with what nuisances can explain taken out.
+    """Residuals and derivatives by recording, with nuisances projected out.
 
     Nuisances are initial states and the noise filter's coefficients. `rows` says which rows count.
     """
@@ -53,7 +53,7 @@ class Reduced(eqx.Module):
 
     @classmethod
     def of(cls, optimum: Optimum, found: Sensitivity | None = None) -> "Reduced":
-        """At an optimum, with its linearisation if there is one already."""
+        """Score of an optimum, from its linearisation if it exists."""
         problem = optimum.problem
         if found is None:
             found = linearise(problem, optimum.theta, optimum.start)
@@ -93,7 +93,7 @@ def spent_by(problem: Problem) -> Float[np.ndarray, " outputs"]:
     if problem.coefficients is not None:
         rows = np.asarray(problem.coefficients.row)[np.asarray(problem.coefficients.there)]
         return spent + np.bincount(rows, minlength=outputs)
-    # A given filter counts as well: as a rule it was estimated from these very residuals.
+    # A given filter counts as well: usually it was estimated from the same residuals.
     taps = np.asarray(problem.noise)
     return spent + np.sum((taps != 0).reshape(outputs, -1), axis=1) - 1
 
@@ -104,7 +104,7 @@ def covariance_of(
     noise: Noise = None,
     found: Sensitivity | None = None,
 ) -> tuple[Float[np.ndarray, "parameters parameters"], tuple[str, ...]]:
-    """Covariance of the loop's parameters, and what the recordings do not determine.
+    """Covariance of the loop's parameters, and notes on undetermined directions.
 
     **Arguments:**
 
@@ -134,7 +134,7 @@ _plain = compiled(unfiltered)
 def _papers_information(
     optimum: Optimum, noise: Noise
 ) -> Float[np.ndarray, "parameters parameters"]:
-    """(A.1) to the letter: one variance of the filtered error for all, and plain gradients."""
+    """(A.1) as printed: one variance of the filtered error, and unfiltered gradients."""
     problem, n = optimum.problem, optimum.problem.loop.joints
     p = problem.loop.theta.shape[0]
     loop = problem.loop.with_theta(jnp.asarray(optimum.theta)[:p])
@@ -155,19 +155,19 @@ def score_covariance(
     residuals: Sequence[Float[np.ndarray, "_samples outputs"]],
     jacobians: Sequence[Float[np.ndarray, "_samples outputs parameters"]],
 ) -> Float[np.ndarray, "parameters parameters"]:
-    """Covariance of J'r where residuals are coloured: their spectrum, weighed by J's.
+    """Covariance of J'r for coloured residuals, from their spectrum and that of J.
 
-    Each output's residuals are taken as one autoregressive process over all recordings, with the
-    order by AIC, but stronger in one recording than in another: noise that grows with the torque
-    is strongest where the derivatives are largest too. Outputs are taken as uncorrelated.
+    Each output's residuals are modelled as one autoregressive process over all recordings, with the
+    order by AIC and a level for each recording: noise that grows with the torque is strongest where
+    the derivatives are largest. Outputs are assumed uncorrelated.
     """
     outputs, p = jacobians[0].shape[1:]
     meat = np.zeros((p, p))
     for o in range(outputs):
         series = [r[:, o] - r[:, o].mean() for r in residuals]
         strengths = [float(np.std(x)) or 1.0 for x in series]
-        # Residuals that passed a low-pass have next to no power above it, and a filter fitted to
-        # them ends in rounding: a white floor 100 dB down keeps it stable and changes nothing else.
+        # Low-passed residuals have almost no power above the cutoff, which makes a fitted filter
+        # ill-conditioned: a white floor at -100 dB keeps it stable.
         floor = np.random.default_rng(0)
         noise = fit_ar(
             [
@@ -184,7 +184,7 @@ def score_covariance(
 
 
 def optimum_of(fit: Fit, what: str) -> Optimum:
-    """Where a fit ended.
+    """The optimum of a fit.
 
     **Raises:** `FitError` for fits that are not least squares on a simulation.
     """
@@ -197,7 +197,7 @@ def optimum_of(fit: Fit, what: str) -> Optimum:
 
 
 def deviations(fit: Fit) -> "pd.DataFrame":
-    """Standard deviations of a fit by every formula, beside each other.
+    """Standard deviations of a fit by every formula, side by side.
 
     **Arguments:**
 

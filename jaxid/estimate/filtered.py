@@ -1,4 +1,4 @@
-"""The filtered regression model: a first-order low-pass in place of accelerations."""
+"""The filtered regression model: a first-order low-pass instead of accelerations."""
 
 from typing import Literal
 
@@ -21,7 +21,7 @@ class FilteredLS(AbstractMethod):
 
     **Arguments:**
 
-    - `pole`: λ, 1/s; by default where the motion's spectrum sinks into noise.
+    - `pole`: λ, 1/s; by default where the motion's spectrum falls below the noise.
     - `transient`, `states`, `weights`: as for `IntegralLS`.
     """
 

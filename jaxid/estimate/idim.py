@@ -27,7 +27,7 @@ Weights = Literal["ordinary", "joint", "robust"]
 
 
 class Stacked(eqx.Module):
-    """The regression of all recordings, decimated: columns, right-hand side, who owns a row."""
+    """The decimated regression of all recordings: columns, right-hand side, row owners."""
 
     columns: Float[np.ndarray, "samples joints parameters"]
     right: Float[np.ndarray, "samples joints"]
@@ -40,13 +40,13 @@ class Stacked(eqx.Module):
 
 
 def stack(loop: ClosedLoop, recordings: Recordings, filtering: Filtering, motions=None) -> Stacked:
-    """Columns and right-hand side of equation (4) over all recordings.
+    """Columns and right-hand side of equation (4) for all recordings.
 
     **Arguments:**
 
     - `loop`: the model.
     - `filtering`: of the motion and, in parallel, of torque and columns.
-    - `motions`: simulated signals in place of the filtered ones, one for each recording.
+    - `motions`: simulated signals instead of the filtered ones, one for each recording.
 
     **Raises:** `FitError` where the filtering does not suit a recording.
     """
@@ -80,8 +80,8 @@ def solve(
 ) -> Solved:
     """Least squares, or instrumental variables where instruments are given.
 
-    Weighted: each joint's rows by its own deviation, found from an ordinary solution first.
-    Robust: each row besides by Huber's weight.
+    Weighted: each joint's rows by its deviation, estimated from an ordinary solution first.
+    Robust: in addition each row by Huber's weight.
     """
     joints, p = stacked.right.shape[1], stacked.columns.shape[2]
     if stacked.right.size <= p:
@@ -112,7 +112,7 @@ def solve(
     count = stacked.right.shape[0] - p / joints
     variance = sigma**2 * stacked.right.shape[0] / count
     if instruments is not None:
-        # What instruments do not share with the columns they say nothing of.
+        # Instruments determine only what they share with the columns.
         basis, size, _ = np.linalg.svd(tools / _lengths(tools), full_matrices=False)
         wide = basis[:, size > 1e-11 * size[0]].T @ wide
     information = wide.T @ wide / variance
@@ -121,7 +121,7 @@ def solve(
 
 
 def _lengths(columns: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, " parameters"]:
-    """Of columns; one for those that are nil."""
+    """Norms of columns; one for zero columns."""
     size = np.linalg.norm(columns, axis=0)
     return np.where(size > 0, size, 1.0)
 
@@ -168,14 +168,14 @@ def regression_fit(
 
 
 def _beyond_bounds(chosen: Sequence[Parameter], theta: Float[np.ndarray, " p"]) -> list[str]:
-    """What to say of values that a regression, which knows no bounds, put outside them."""
+    """A note on values outside their bounds, which a regression does not enforce."""
     bounds = Bounds.of(chosen)
     low, high = (np.asarray(x) for x in (bounds.lower, bounds.upper))
     names = [name for p in chosen for name in p.names]
     outside = [n for n, out in zip(names, (theta < low) | (theta > high), strict=True) if out]
     if not outside:
         return []
-    return [f"{', '.join(outside)} outside the declared bounds, which a regression does not know"]
+    return [f"{', '.join(outside)} outside the declared bounds, which regressions do not enforce"]
 
 
 class IDIM(AbstractMethod):

@@ -1,4 +1,4 @@
-"""The integral method: a second-order integral operator in place of every derivative."""
+"""The integral method: a second-order integral operator instead of derivatives."""
 
 import math
 from typing import Literal
@@ -15,23 +15,24 @@ from .states import AbstractStates, LowPass
 
 
 def default_pole(recording: Recording) -> float:
-    """Where the recorded motion's spectrum sinks into noise, 1/s."""
+    """Angular frequency above which the recorded motion is noise, 1/s."""
     return min(2 * math.pi * signal_cutoff(recording), 0.3 * math.pi * recording.rate)
 
 
 class IntegralLS(AbstractMethod):
     """Least squares on the split regression through a second-order integral operator.
 
-    Every term passes F(s) = λ1 λ2 / ((s + λ1)(s + λ2)), and what would be differentiated once or
-    twice passes s F(s) or s² F(s) instead, integrated exactly over each sample: no acceleration is
-    needed, and position alone makes the inertial terms (Li, Peng, Juang 2023, equation (42) and
-    Appendix A).
+    Every term is filtered by F(s) = λ1 λ2 / ((s + λ1)(s + λ2)). First and second derivatives become
+    the filters s F(s) and s² F(s), integrated exactly over each sample. No acceleration is needed,
+    and the inertial terms depend on position only (Li, Peng, Juang 2023, equation (42) and Appendix
+    A).
 
     **Arguments:**
 
-    - `lambda1`, `lambda2`: poles, 1/s; by default where the motion's spectrum sinks into noise.
-    - `transient`: the operator's answer to its unknown initial state is `"modelled"` by two
-      columns a joint, `"dropped"` with the first ten time constants, or `"ignored"`.
+    - `lambda1`, `lambda2`: poles, 1/s; by default where the motion's spectrum falls below
+      the noise.
+    - `transient`: the response to the unknown initial state is `"modelled"` by two columns for each
+      joint, `"dropped"` with the first ten time constants, or `"ignored"`.
     - `states`: where velocities come from.
     - `weights`: `"joint"` (each joint by its own deviation), or `"encoder"` (Appendix C: the
       covariance that follows from the recordings' resolution).

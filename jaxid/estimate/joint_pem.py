@@ -1,4 +1,4 @@
-"""Joint prediction error: physical parameters and noise filters in one minimisation."""
+"""Joint prediction error method: physical parameters and noise filters in one minimisation."""
 
 import dataclasses
 import time
@@ -33,18 +33,18 @@ class JointPEM(AbstractMethod):
 
     Minimises the determinant of the prediction error's covariance over physical parameters, AR
     coefficients and initial states together (Ljung 1999, section 7.5). The residual is linear in
-    the coefficients, so that one run of the simulation's sensitivities serves all columns.
+    the coefficients, so one run of the simulation's sensitivities gives all derivatives.
 
     **Arguments:**
 
     - `oem`: output, start, initial states and bounds are those of this method.
     - `orders`: of the AR filters, one for each output, whose coefficients then start at zero; None
       to fit by `oem` first, choose orders from its residuals, and start there.
-    - `criterion`, `highest`, `white`: how, as for `SeparablePEM`.
-    - `coupled`: every output's filter takes the past of all outputs.
+    - `criterion`, `highest`, `white`: of that choice, as for `SeparablePEM`.
+    - `coupled`: whether every output's filter depends on the past of all outputs.
     - `deviations`: `"white"` for (A.1), `"sandwich"` or `"paper"`.
 
-    **Raises:** `NoiseError` where the data do not allow such filters; its `fit` is what there was.
+    **Raises:** `NoiseError` where the data do not allow such filters; its `fit` is the fit so far.
     """
 
     oem: OEM = OEM()
@@ -103,7 +103,7 @@ def _converge_jointly(
     say: Callable[[str], None],
     deadline: float,
 ) -> Converged:
-    """Minimises, then again with the noise covariance that follows, until that settles.
+    """Minimises repeatedly with the updated noise covariance, until that converges.
 
     At that point the gradient of the squared error is the gradient of the determinant.
     """

@@ -1,4 +1,4 @@
-"""The output-error method: simulate the closed loop, compare, follow the exact gradient."""
+"""The output-error method: simulation of the closed loop, with exact derivatives."""
 
 import dataclasses
 import math
@@ -31,14 +31,14 @@ from .start import start_values
 class OEM(AbstractMethod):
     """Output error, equations (7) and (9) of Brunot et al. 2016, by Levenberg–Marquardt.
 
-    All recordings at once, each output weighted by its own deviation, iterates kept physical.
+    Fits all recordings at once, weights each output by its deviation, and keeps values physical.
 
     **Arguments:**
 
     - `output`: what is compared: `"torque"`, `"position"` or `"both"`; by default torque, but
       position where the recorded torque drives the arm.
-    - `start`: `"auto"` takes the best of the loop's own values, IDIM's and, where those leave more
-      than a fifth of the torque, DIDIM's; `"given"` starts from the loop's values.
+    - `start`: `"auto"` starts from the best of the loop's own values, IDIM's and, where those leave
+      more than a fifth of the torque, DIDIM's; `"given"` from the loop's values.
     - `initial`: `"rest"` trusts the first sample, `"free"` estimates every initial state,
       `"auto"` estimates those of recordings that do not start at rest.
     - `window`: length in s of pieces simulated on their own, each from its own estimated state
@@ -47,12 +47,12 @@ class OEM(AbstractMethod):
       the paper prints.
     - `tolerance`: it stops when a step is shorter than this many standard deviations.
     - `max_steps`: largest number of iterations, those for better weights included.
-    - `max_seconds`: longest time, looked at between iterations; what is found until then is given.
-    - `progress`: whether to show it on a terminal.
-    - `solver`: an optimistix least-squares solver or minimiser in place of jaxid's own
-      Levenberg–Marquardt. It stops by its own tolerances in place of `tolerance`, keeps to bounds
-      by a change of variables, so that it comes near a bound but not onto it, and takes initial
-      states as so many parameters more.
+    - `max_seconds`: time limit, checked between iterations; the values so far are returned.
+    - `progress`: whether to show progress on a terminal.
+    - `solver`: an optimistix least-squares solver or minimiser instead of jaxid's own
+      Levenberg–Marquardt. It stops by its own tolerances and treats initial states as additional
+      parameters. Bounds are enforced by a change of variables, so an estimate can approach a bound
+      but not reach it.
     - `mesh`: a `jax.sharding.Mesh` whose devices share the recordings; the numbers stay the same.
     """
 
@@ -82,7 +82,7 @@ class OEM(AbstractMethod):
     def fit(self, loop: ClosedLoop, recordings: Recordings) -> Fit:
         """Estimates the loop's free parameters; called by `jaxid.fit`."""
         started = time.perf_counter()
-        # What does not fit together is said before the work, not after it.
+        # Inconsistent inputs are refused before the computation.
         compared_signals(self, loop)
         check_solver(self.solver, self.mesh)
         batch = prepare(loop, pieces_of(recordings, self.window))
@@ -107,7 +107,7 @@ class OEM(AbstractMethod):
         return dataclasses.replace(found, notes=(*found.notes, *more))
 
     def _forgotten(self, loop: ClosedLoop) -> list[str]:
-        """What to say of states that windows do not hand on; only positions and velocities are."""
+        """A note on states that are not continued from window to window."""
         if self.window is None:
             return []
         zeros = jnp.zeros(loop.joints)
@@ -116,8 +116,8 @@ class OEM(AbstractMethod):
         own += [type(loop.controller).__name__] if sum(x.size for x in jax.tree.leaves(law)) else []
         if not own:
             return []
-        said = "every window begins with the states of {} at rest, by which values may be off"
-        return [f"{said.format(', '.join(own))}: see whether they stay without window"]
+        said = "every window starts with the states of {} at rest, which may bias the estimates"
+        return [f"{said.format(', '.join(own))}: compare with a fit without window"]
 
     def _from_start(
         self,
@@ -134,7 +134,7 @@ class OEM(AbstractMethod):
 
 
 def _without_diverging(loop: ClosedLoop, recordings: Recordings) -> Recordings:
-    """The recordings along which the loop can be simulated; all of them where it cannot at all."""
+    """The recordings along which the loop can be simulated; all of them if there are none."""
     runs = simulate(loop, recordings)
     sound = [np.isfinite(run.states).all() and np.isfinite(run.tau).all() for run in runs]
     kept = [r for r, good in zip(recordings, sound, strict=True) if good]
@@ -152,7 +152,7 @@ def _left_out(recordings: Recordings, kept: Recordings) -> list[str]:
 
 
 def oem_of(fit: object) -> OEM:
-    """The output error that a fit's method is or builds on; that of defaults where it has none."""
+    """The `OEM` that a fit's method is or contains; the default one if it has none."""
     method = getattr(fit, "method", None)
     method = getattr(method, "oem", method)
     return method if isinstance(method, OEM) else OEM()

@@ -1,4 +1,4 @@
-"""Separable prediction error: the output error through the inverse of an estimated noise filter."""
+"""Separable prediction error method: output error filtered by an estimated noise model."""
 
 import contextlib
 import time
@@ -52,18 +52,18 @@ class SeparablePEM(AbstractMethod):
     - `oem`: output, start, initial states and bounds are those of this method.
     - `filters`: noise filters to use as given, one for each output; None to estimate them.
     - `criterion`: `"aic"`, `"aicc"` or `"bic"`, by which the orders are chosen over 0..`highest`.
-    - `white`: significance at which Ljung and Box's test refuses an order whose innovations are
-      not white (CAPTAIN's `aic` has such a condition, Young 2011); None for the criterion alone.
-    - `orders`: of the filters, one for each output, in place of a choice.
+    - `white`: significance of Ljung and Box's test, by which orders without white innovations are
+      rejected (as in CAPTAIN's `aic`, Young 2011); None for the criterion alone.
+    - `orders`: of the filters, one for each output, instead of a choice.
     - `coupled`: one filter for all joints together, each driven by the past of all.
     - `first_step`: `"filtered"` for parameters from the filtered error; `"plain"` for the paper's
-      own variant, whose parameters ignore the filter and stay those of output error.
+      variant, in which the parameters are those of output error.
     - `deviations`: `"white"` for (A.1), `"sandwich"`, `"paper"`; by default the first where
       parameters come from the filtered error and all recordings are as noisy, else the second.
     - `tolerance`: relative change of the prediction error's variance at which it stops.
     - `rounds`: largest number of alternations.
 
-    **Raises:** `NoiseError` where the residuals allow no such filter; its `fit` is what there was.
+    **Raises:** `NoiseError` where the residuals allow no such filter; its `fit` is the fit so far.
     """
 
     oem: OEM = OEM()
@@ -98,7 +98,7 @@ class SeparablePEM(AbstractMethod):
         return report(kind, done, recordings, seconds, self, noise, rounds)
 
     def _deviations(self, done: Converged, noise: Noise) -> Deviations:
-        """(A.1) knows one level of noise: the other where recordings differ by more than chance."""
+        """(A.1) assumes one noise level: the sandwich where recordings differ significantly."""
         ratios = np.stack(levels([innovations(x, noise) for x in residual_series(done)]))
         uneven = np.any(ratios.max(axis=0) > 1.3 * ratios.min(axis=0))
         return "sandwich" if uneven or self.first_step == "plain" else "white"
@@ -110,7 +110,7 @@ class SeparablePEM(AbstractMethod):
         say: Callable[[str], None],
         deadline: float,
     ) -> tuple[Converged, Noise, int]:
-        """Where it ended, with which filters, after how many alternations."""
+        """The final fit and filters, and the number of alternations."""
         if self.filters is not None:
             outputs = len(compared_signals(self.oem, loop)) * loop.joints
             given = self.filters
@@ -139,7 +139,7 @@ class SeparablePEM(AbstractMethod):
 
 @contextlib.contextmanager
 def keeping(done: Converged, method: OEM, recordings: Recordings) -> Iterator[None]:
-    """Hands the fit so far on with a `NoiseError`."""
+    """Attaches the fit so far to a `NoiseError`."""
     try:
         yield
     except NoiseError as error:

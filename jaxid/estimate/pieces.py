@@ -1,4 +1,4 @@
-"""What a method compares: pieces of recordings, their signals, and first weights."""
+"""Compared signals, windows of recordings, and start weights."""
 
 from collections.abc import Sequence
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -18,7 +18,7 @@ Output = Literal["torque", "position", "both"]
 
 @runtime_checkable
 class OutputErrorSettings(Protocol):
-    """What all methods that minimise a simulation's error are set by; `OEM` says what each is."""
+    """Settings of all methods that minimise a simulation's error; see `OEM`."""
 
     output: Output | None
     initial: Literal["auto", "rest", "free"]
@@ -30,7 +30,7 @@ class OutputErrorSettings(Protocol):
 
 
 def pieces_of(recordings: Recordings, window: float | None) -> tuple[Recording, ...]:
-    """The recordings cut into windows that share their end samples; whole where None."""
+    """The recordings cut into windows that share their end samples; unchanged if None."""
     if window is None:
         return tuple(recordings)
     pieces = []
@@ -51,7 +51,7 @@ def pieces_of(recordings: Recordings, window: float | None) -> tuple[Recording, 
 
 
 def rejoined(recordings, pieces, measured, errors):
-    """Windows put together again by recording; a sample that two share is kept once."""
+    """Windows joined again by recording; shared samples are kept once."""
     if len(pieces) == len(recordings):
         return measured, errors
 
@@ -90,7 +90,7 @@ def estimated_starts(
 def first_weights(
     loop: ClosedLoop, pieces: Sequence[Recording], signals: tuple[str, ...]
 ) -> Float[np.ndarray, " outputs"]:
-    """One over a tenth of each output's size: the first guess, before residuals are known."""
+    """Inverse of a tenth of each output's size, the start weights before residuals are known."""
     sizes = []
     for signal in signals:
         values = np.concatenate([getattr(piece, signal) for piece in pieces])

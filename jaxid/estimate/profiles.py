@@ -1,4 +1,4 @@
-"""Likelihood profiles: how much the error grows when one parameter is held elsewhere."""
+"""Likelihood profiles: the increase of the error when one parameter is held at other values."""
 
 import dataclasses
 import html
@@ -37,9 +37,9 @@ class Profile(AbstractShown):
     others: Float[np.ndarray, "points parameters"]
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Values whose deviance a share `level` of recordings would not exceed at the truth.
+        """Confidence interval of a level from the deviance.
 
-        An end that lies beyond the profile, as where a bound cuts it off, is its last value.
+        An end beyond the profile, such as at a bound, is the last value of the profile.
         """
         import scipy
 
@@ -90,14 +90,14 @@ class Profile(AbstractShown):
 def profile(fit: Fit, *names: str, progress: bool = True) -> dict[str, Profile]:
     """Likelihood profiles, all points of all of them fitted at once, vmapped.
 
-    Where a fit shows sandwich deviations its error is not taken for white, and the deviance is
-    scaled by the ratio of (A.1)'s variance to the sandwich's (Pace, Salvan, Sartori 2011).
+    For a fit with sandwich deviations the error is not white, and the deviance is scaled by the
+    ratio of (A.1)'s variance to the sandwich's (Pace, Salvan, Sartori 2011).
 
     **Arguments:**
 
     - `fit`: by `OEM`, `SeparablePEM` or `JointPEM`; the noise filters of the former two are kept.
     - `names`: of parameters; all of them by default.
-    - `progress`: show a line on the terminal while it works.
+    - `progress`: whether to show progress on a terminal.
 
     **Raises:** `FitError` for a fit by regression, or a parameter that it does not determine.
     """
@@ -137,7 +137,7 @@ def profile(fit: Fit, *names: str, progress: bool = True) -> dict[str, Profile]:
         row += len(values)
         share = 1 / _stretch(fit, width, k, scaled) ** 2
         deviance = np.maximum(loss[rows] - base, 0.0) / variance * share
-        # The estimate itself is a point of its profile; it may be one already, on a bound.
+        # The estimate is a point of its profile, possibly already present at a bound.
         apart = values != theta[k]
         order = np.argsort(np.append(values[apart], theta[k]))
         p = len(fit.names)
@@ -161,7 +161,7 @@ def _place(fit: Fit, name: str) -> int:
 
 
 def _stretch(fit: Fit, white: Float[np.ndarray, " parameters"], k: int, scaled: bool) -> float:
-    """How much wider than (A.1) has it the profile is to be."""
+    """Factor by which the profile is wider than by (A.1)."""
     return float(fit.std[k] / white[k]) if scaled else 1.0
 
 

@@ -1,4 +1,4 @@
-"""Many fits at once, from values close by: what bootstrap, profiles and coverage are made of."""
+"""Many fits at once from nearby start values, for bootstrap, profiles and coverage."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -30,12 +30,12 @@ from .minimise import (
 )
 from .result import Fit
 
-# Lanes of one vmap: enough to fill the vector units, few enough for the caches.
+# Fits in one vmap: enough to fill the vector units, few enough for the caches.
 LANES = 8
 
 
 class Lanes(eqx.Module):
-    """What differs from one fit to the next; `(lanes,)` before every axis.
+    """The inputs that differ between fits; `(lanes,)` before every axis.
 
     - `measured`: signals to fit, outputs in the order of the problem's weights.
     - `noise`: polynomials of the noise filter. `lower`, `upper`: bounds. `theta`: start values.
@@ -54,7 +54,7 @@ class Lanes(eqx.Module):
         count: int,
         measured: Float[np.ndarray, "lanes recordings samples outputs"] | None = None,
     ) -> "Lanes":
-        """So many fits of an optimum's own problem, of other signals if they are given."""
+        """Inputs of a number of fits of an optimum's problem, with other signals if given."""
         problem = optimum.problem
 
         def each(x) -> Array:
@@ -70,13 +70,13 @@ class Lanes(eqx.Module):
 
 
 class Refitted(eqx.Module):
-    """Where the fits ended; `(lanes,)` before every axis.
+    """Results of the fits; `(lanes,)` before every axis.
 
     - `theta`: values; `loss`: squared filtered error, in units of the problem's weights.
     - `last`: squared length of the last step, in deviations.
     - `raw`, `residual`: weighted residual before and after the filter.
-    - `jacobian`: of the filtered residual by the loop's parameters, with what initial states and
-      filter coefficients can explain taken out.
+    - `jacobian`: of the filtered residual with respect to the loop's parameters, with initial
+      states and filter coefficients projected out.
     """
 
     theta: Float[Array | np.ndarray, "*lanes values"]
@@ -105,7 +105,7 @@ def _solver(problem: Problem) -> LevenbergMarquardt:
 def _settle(
     problem: Problem, near: Sensitivity, theta: Float[Array, " values"], start, steps: int
 ) -> tuple[Float[Array, " values"], Float[Array, "recordings initials"]]:
-    """Steps with the simulation's sensitivities of close by, and everything else exact."""
+    """Gauss-Newton steps with sensitivities from nearby values, and all else exact."""
     n, own, solver = problem.loop.joints, problem.loop.theta.shape[0], _solver(problem)
 
     def point_at(theta, start) -> Point:
@@ -145,7 +145,7 @@ def _last_step(
 
 
 def _own_columns(problem: Problem, point: Point) -> Float[Array, "recordings samples outputs p"]:
-    """The loop's columns with what initial states and filter coefficients explain taken out."""
+    """The loop's columns with initial states and filter coefficients projected out."""
     p = problem.loop.theta.shape[0]
     columns = absorb_start(point.found, problem.free).jacobian
     if problem.coefficients is None:
@@ -202,9 +202,9 @@ def refit(
 ) -> Refitted:
     """Fits of a problem with other signals, filters, bounds or start values, vmapped.
 
-    Gauss-Newton with weights kept: some steps with the sensitivities of the problem's own values,
-    which need no more than a simulation each, and a last one with those of where they led. For
-    fits that end close to the problem's own, as `Refitted.last` tells.
+    Gauss-Newton with fixed weights: some steps with the sensitivities at the problem's own values,
+    which need only a simulation each, and a last step with sensitivities at the new values.
+    Suitable for fits that end close to the problem's own; check `Refitted.last`.
 
     **Arguments:**
 
@@ -215,7 +215,7 @@ def refit(
     count, pieces = lanes.theta.shape[0], []
     for begin in range(0, count, LANES):
         say(f"{begin} of {count} fits", begin / count)
-        # Always as many, the last ones again where they run out: one program serves all counts.
+        # A fixed number, padded with the last ones, so that one program serves all counts.
         rows = np.minimum(np.arange(begin, begin + LANES), count - 1)
         some = jax.tree.map(lambda x, rows=rows: x[rows], lanes)
         pieces.append(jax.tree.map(np.asarray, _refit_some(optimum, some, steps)))
@@ -225,7 +225,7 @@ def refit(
 def redrawn(
     fit: Fit, noise: Sequence[Float[np.ndarray, "draws _samples outputs"]]
 ) -> Float[np.ndarray, "draws recordings samples outputs"]:
-    """Signals that the fitted model would have given under other noise, padded.
+    """Signals of the fitted model under other noise, padded.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""From signals to a linear regression: filtered motion, columns, decimation."""
+"""Linear regression from signals: filtered motion, columns, decimation."""
 
 import dataclasses
 from collections.abc import Callable
@@ -26,7 +26,7 @@ class Filtering(eqx.Module):
     **Arguments:**
 
     - `cutoff`: of the low-pass on position, applied forward and backward, Hz; by default where
-      the recorded motion's spectrum sinks into noise.
+      the recorded motion's spectrum falls below the noise.
     - `rate`: sample rate after decimation, Hz; by default the cutoff.
     - `order`: of the Butterworth filter.
     - `trim`: dropped at both ends, s; by default five samples after decimation.
@@ -38,7 +38,7 @@ class Filtering(eqx.Module):
     trim: float | None = eqx.field(static=True, default=None)
 
     def on(self, recording: Recording) -> "Filtering":
-        """The same with its cutoff settled, so that the spectrum is looked at once."""
+        """The same with a fixed cutoff, so that the spectrum is computed once."""
         return dataclasses.replace(self, cutoff=self.settled(recording)[0])
 
     def settled(self, recording: Recording) -> tuple[float, int, int]:
@@ -67,7 +67,7 @@ class Filtering(eqx.Module):
 def filtered(recording: Recording, filtering: Filtering) -> Simulated:
     """Position, velocity and acceleration by zero-phase filtering and central differences.
 
-    Uneven samples are first laid on an even grid.
+    Uneven samples are first interpolated to an even grid.
     """
     cutoff, _, _ = filtering.settled(recording)
     time = even_times(recording)
@@ -95,7 +95,7 @@ def linear_parameters(loop: ClosedLoop) -> tuple[Parameter, ...]:
 def effect_states(
     loop: ClosedLoop, time: Float[Array, " samples"], motion: Motion
 ) -> tuple[Float[Array, "samples _"], ...]:
-    """The effects' own states along a given motion, by Heun's method between samples.
+    """The effects' states along a given motion, by Heun's method between samples.
 
     `motion` has `(samples,)` before every axis.
     """
@@ -118,7 +118,7 @@ def effect_states(
 
 
 def mismatch(loop: ClosedLoop, at: Motion) -> Float[Array, "samples joints"]:
-    """What the motion takes less what the drives deliver, along samples, `(samples, joints)`."""
+    """Inverse dynamics minus delivered torque at the samples, `(samples, joints)`."""
     states = effect_states(loop, at.t, at)
 
     def one(motion: Motion, own: tuple[Float[Array, " _"], ...]) -> Float[Array, " joints"]:
@@ -167,7 +167,7 @@ def regression(
 def decimator(
     recording: Recording, filtering: Filtering
 ) -> Callable[[Float[np.ndarray, "samples *axes"]], Float[np.ndarray, "kept *axes"]]:
-    """The parallel filter that torque and every column pass alike, and its decimation."""
+    """The parallel filter of torque and all columns, with its decimation."""
     import scipy
 
     _, factor, trim = filtering.settled(recording)

@@ -44,7 +44,7 @@ def report(
     measured = compared(done.loop, done.pieces, measured)
     errors = [r[:, :n] for r in unweighted]
     measured, errors = rejoined(recordings, done.pieces, measured, errors)
-    # Of a motion that is simulated, a minimisation has looked at it all along.
+    # For a simulated motion the minimisation has checked it at every step.
     wrong = unphysical(done.loop) if imposed(done.loop) else []
     notes = (*_at_bounds(done.loop), *wrong, *done.minimum.notes)
     return Fit(

@@ -1,4 +1,4 @@
-"""Parametric bootstrap: fits of what the fitted model and its noise would have recorded."""
+"""Parametric bootstrap: fits of recordings simulated with the fitted model and its noise."""
 
 import dataclasses
 from typing import TYPE_CHECKING
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Bootstrap(AbstractShown):
-    """Estimates from recordings drawn anew, `(draws, parameters)`, beside the fit they belong to.
+    """Estimates from simulated recordings, `(draws, parameters)`, with the original fit.
 
     `settled` says which draws ended within a tenth of a deviation of their minimum.
     """
@@ -35,7 +35,7 @@ class Bootstrap(AbstractShown):
         return self.theta.std(axis=0, ddof=1)
 
     def interval(self, level: float = 0.95) -> Float[np.ndarray, "parameters 2"]:
-        """Basic bootstrap intervals: draws scatter about the fit as the fit about the truth."""
+        """Basic bootstrap intervals: draws scatter around the fit like the fit around the truth."""
         tail = (1 - level) / 2
         low, high = np.quantile(self.theta, [tail, 1 - tail], axis=0)
         return np.stack([2 * self.fit.theta - high, 2 * self.fit.theta - low], axis=1)
@@ -81,26 +81,26 @@ class Bootstrap(AbstractShown):
 
 
 def bootstrap(fit: Fit, draws: int = 200, *, seed: int = 0, progress: bool = True) -> Bootstrap:
-    """Fits recordings that the fitted model would have given under noise drawn anew, vmapped.
+    """Fits recordings simulated with the fitted model and new noise, vmapped.
 
-    Noise comes from the fit's filters, stationary and stable; a fit by `OEM`, which has none, gets
-    them from its residuals (Burg, AIC). Each draw is a few Gauss-Newton steps from the estimate;
-    for `SeparablePEM` with the filters of each draw estimated anew, for `JointPEM` with their
-    coefficients among the values.
+    Noise comes from the fit's filters; for a fit by `OEM`, which has none, filters are estimated
+    from its residuals (Burg, AIC). Each draw takes a few Gauss-Newton steps from the estimate. For
+    `SeparablePEM` the filters are estimated again for each draw; for `JointPEM` their coefficients
+    are among the parameters.
 
     **Arguments:**
 
     - `fit`: by `OEM`, `SeparablePEM` or `JointPEM`.
-    - `draws`: how many.
-    - `seed`: of the noise. `progress`: show a line on the terminal while it works.
+    - `draws`: number of simulated sets of recordings.
+    - `seed`: of the noise. `progress`: whether to show progress on a terminal.
 
     **Raises:** `FitError` for a fit by regression, with `Tracking()`, or that did not succeed.
     """
     problem = optimum_of(fit, "bootstrap").problem
     if not fit.succeeded or not np.isfinite(problem.weights).all():
-        raise FitError(f"a fit that {fit.status.value} has no bootstrap: see that it converges")
+        raise FitError(f"a fit that {fit.status.value} has no bootstrap: make it converge first")
     if draws < 2:
-        raise FitError(f"{draws} draws have no deviation: give 2 or more, 200 for intervals")
+        raise FitError(f"{draws} draws give no deviation: use 2 or more, 200 for intervals")
     noise = fit.noise
     if noise is None:
         noise = residual_filters(fit)
@@ -112,7 +112,7 @@ def bootstrap(fit: Fit, draws: int = 200, *, seed: int = 0, progress: bool = Tru
     with working(f"bootstrap of {fit.loop.name}", progress) as say:
         found = refit_signals(fit, redrawn(fit, made), say=say)
     p = len(fit.names)
-    # The last step of a hundredth is squared: a tenth of a deviation.
+    # 0.01 is the squared length: a tenth of a deviation.
     return Bootstrap(fit, np.asarray(found.theta)[:, :p], np.asarray(found.last) < 1e-2)
 
 

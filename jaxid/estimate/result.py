@@ -1,4 +1,4 @@
-"""What every method is, and what every fit gives."""
+"""Base class of methods, and the result of a fit."""
 
 import abc
 import enum
@@ -33,8 +33,8 @@ class Status(enum.Enum):
     max_steps = "reached the largest number of iterations; raise max_steps"
     max_seconds = "reached its limit of time; raise max_seconds"
     diverged = "no parameter values were found at which the loop can be simulated"
-    overflowed = "its numbers leave what float64 holds; check the units of the recordings"
-    unphysical = "ended at values that no robot has: the mass matrix is not positive definite"
+    overflowed = "numbers overflowed float64; check the units of the recordings"
+    unphysical = "ended at unphysical values: the mass matrix is not positive definite"
     misfit = "describes the recordings no better than no model would"
     out_of_solver_steps = (
         "the integration ran out of steps before a recording's end; raise Stepping(max_steps=...), "
@@ -42,7 +42,7 @@ class Status(enum.Enum):
     )
     smallest_solver_step = (
         "the integration's step fell below the smallest one allowed; choose an implicit solver, or "
-        "look for a value that makes the loop so stiff"
+        "look for a value that makes the loop stiff"
     )
     implicit_step_failed = (
         "an implicit step found no solution; take smaller steps or another solver"
@@ -50,7 +50,7 @@ class Status(enum.Enum):
 
     @property
     def simulated(self) -> bool:
-        """Whether there were values at which the loop could be simulated."""
+        """Whether the loop could be simulated at some values."""
         return self not in (
             Status.diverged,
             Status.out_of_solver_steps,
@@ -60,18 +60,18 @@ class Status(enum.Enum):
 
 
 class Fit(AbstractShown):
-    """What an estimate gave: a loop with its parameters, how sure they are, and how it went.
+    """Result of an estimation: the fitted loop, covariance, residuals, status.
 
     - `loop`: the model with the estimated values.
     - `covariance`: of `loop.theta`, `(parameters, parameters)`; infinite where not determined.
     - `residuals`: measured less simulated torque (for a position output: position), one
       `(samples, joints)` for each recording.
-    - `undetermined`: sentences that name the directions the data say nothing about.
-    - `notes`: what else a reader should know.
+    - `undetermined`: sentences that name combinations of parameters that the data do not determine.
+    - `notes`: other remarks.
     - `noise`: the noise filters found or given, one for each output or one of all; None for white.
-    - `rounds`: how often parameters and filters were estimated in turn.
-    - `optimum`: the least-squares problem at its minimum, from which deviations, bootstrap and
-      profile follow; None for regressions.
+    - `rounds`: number of alternations between parameters and filters.
+    - `optimum`: the least-squares problem at its minimum, for deviations, bootstrap and profile;
+      None for regressions.
     """
 
     loop: ClosedLoop
@@ -166,7 +166,7 @@ class Fit(AbstractShown):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything a report needs, as plain JSON."""
+        """The fit as plain JSON."""
         return {
             "robot": self.loop.name,
             "method": repr(self.method),
@@ -186,11 +186,11 @@ class Fit(AbstractShown):
         }
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Writes the fit to one file, from which `jaxid.load` gives it back.
+        """Writes the fit to one file, which `jaxid.load` reads.
 
         **Arguments:**
 
-        - `path`: by convention with the ending `.jaxid`; a file that is there is replaced.
+        - `path`: by convention with the ending `.jaxid`; an existing file is replaced.
 
         **Raises:** `SaveError` where it cannot be written.
         """
@@ -228,7 +228,7 @@ class Fit(AbstractShown):
 class AbstractMethod(eqx.Module):
     """An estimator with its settings.
 
-    Class attribute, False by default: `rigid`, of methods that take what the sensors report for
+    Class attribute, False by default: `rigid`, True for methods that assume that the sensors show
     the motion of drives and links.
     """
 
@@ -255,7 +255,7 @@ def relative_errors(
     """100 · ‖residual‖ / ‖measured‖ by recording and joint (Table 3 of Brunot et al. 2016)."""
     import pandas as pd
 
-    # Of a loop that runs away the error is infinite, which is no cause for a warning.
+    # The error of a diverging loop is infinite; no warning is needed.
     with np.errstate(over="ignore"):
         rows = [
             100 * np.linalg.norm(e, axis=0) / np.linalg.norm(m, axis=0)
@@ -279,7 +279,7 @@ def determined_covariance(
     scales: Float[np.ndarray, " parameters"],
     meat: Float[np.ndarray, "parameters parameters"] | None = None,
 ) -> tuple[Float[np.ndarray, "parameters parameters"], tuple[str, ...]]:
-    """The inverse of an information matrix, and what the data say nothing about.
+    """The inverse of an information matrix, and the directions that the data do not determine.
 
     **Arguments:**
 
@@ -288,18 +288,18 @@ def determined_covariance(
     - `meat`: covariance of the score where it is not `information`; gives the sandwich.
     """
     if not (np.isfinite(information).all() and (meat is None or np.isfinite(meat).all())):
-        lost = "the signals' derivatives leave what float64 holds, so that no deviation is known"
+        lost = "the signals' derivatives overflow float64, so no deviation is known"
         return np.diag(np.full(len(names), np.inf)), (lost,)
     size = np.sqrt(np.maximum(np.diag(information), 0))
-    # Ten thousand times a parameter's usual size without a trace in the signals: its column is
-    # what rounding left of a motion that was not made.
+    # A parameter without influence even at ten thousand times its usual size: its column is
+    # rounding only.
     heard = size * scales > 1e-4
     size = np.where(heard, size, 0.0)
     information = information * np.outer(heard, heard)
     floor = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(information / np.outer(floor, floor))
-    # Columns have unit length, so that rounding stands at 1e-16 and a direction below 1e-11 is
-    # one along which the signals change by less than their own rounding.
+    # Columns have unit length and rounding is 1e-16, so along a direction below 1e-11 the signals
+    # change by less than their own rounding.
     weak = values < 1e-11
     strong = vectors[:, ~weak]
     inverse = (strong / values[~weak]) @ strong.T / np.outer(floor, floor)
@@ -325,7 +325,7 @@ def determined_covariance(
 
 
 def unphysical(loop: ClosedLoop) -> list[str]:
-    """What to say of an arm whose mass matrix is not positive definite."""
+    """A note where the mass matrix is not positive definite."""
     if float(_smallest_inertia(loop.arm)) > 0:
         return []
     return ["these values are not physical: the mass matrix is not positive definite"]

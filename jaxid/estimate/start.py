@@ -1,4 +1,4 @@
-"""Where output error starts: the values of inverse dynamics, if those do better."""
+"""Start values of output error, from inverse dynamics if they are better."""
 
 from collections.abc import Callable
 
@@ -25,8 +25,8 @@ def start_values(
 ) -> ClosedLoop:
     """The loop at the best start: its own values, IDIM's or DIDIM's, by simulated torque error.
 
-    DIDIM is asked only where the others leave much of the torque. Parameters in which torque is
-    not linear keep their values.
+    DIDIM is used only where the others leave much of the torque. Parameters in which torque is not
+    linear keep their values.
 
     **Arguments:**
 
@@ -61,7 +61,7 @@ def _by_didim(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " l
     return np.asarray(DIDIM(max_steps=4).fit(loop, recordings).theta)
 
 
-# Share of the squared torque, mean over the joints, from which on a fit needs no better start.
+# Share of the squared torque, mean over joints, below which no better start is needed.
 _NEAR = 0.2**2
 
 

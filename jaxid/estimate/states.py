@@ -22,7 +22,7 @@ Rates = tuple[
 
 
 class AbstractStates(eqx.Module):
-    """How position, velocity and acceleration follow from recorded positions: linearly."""
+    """A linear estimate of position, velocity and acceleration from recorded positions."""
 
     def __check_init__(self):
         check_words(self)
@@ -34,19 +34,19 @@ class AbstractStates(eqx.Module):
         **Arguments:**
 
         - `recording`: whose sample rate and spectrum decide the settings.
-        - `x`: what takes the place of its positions.
+        - `x`: samples used instead of its positions.
         """
 
     @abc.abstractmethod
     def edge(self, recording: Recording) -> int:
-        """Samples at each end that are not to be trusted."""
+        """Samples at each end that are not reliable."""
 
     @abc.abstractmethod
     def memory(self, recording: Recording) -> int | None:
-        """Samples over which one of them is felt; None for all."""
+        """Number of samples that one sample affects; None for all."""
 
     def resolved(self, recording: Recording) -> "AbstractStates":
-        """The same with everything settled that the recording decides."""
+        """The same with settings fixed for a recording."""
         return self
 
     def motion(self, recording: Recording) -> Simulated:
@@ -155,9 +155,9 @@ class FourierStates(AbstractStates):
         return q, v, a
 
     def edge(self, recording: Recording) -> int:
-        """None: a series has no ends."""
+        """Zero: a series has no ends."""
         return 0
 
     def memory(self, recording: Recording) -> None:
-        """Every sample is felt everywhere."""
+        """None: every sample affects all."""
         return None

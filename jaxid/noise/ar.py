@@ -1,4 +1,4 @@
-"""Autoregressive noise filters H = 1/A, one a joint."""
+"""Autoregressive noise filters H = 1/A, one for each joint."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
@@ -57,7 +57,7 @@ class ARFilter(eqx.Module):
             k = a[-1]
             found.append(k)
             if abs(k) >= 1:
-                # No step down from here: the filter is unstable, whatever the others are.
+                # The recursion ends here: the filter is unstable.
                 found += [np.inf] * (len(a) - 2)
                 break
             a = ((a - k * a[::-1]) / (1 - k**2))[:-1]
@@ -89,13 +89,13 @@ class ARFilter(eqx.Module):
         )
 
     def stabilised(self) -> "ARFilter":
-        """The stable filter of the same spectrum: poles outside the unit circle turned inside."""
+        """The stable filter of the same spectrum: poles are reflected into the unit circle."""
         if self.stable:
             return self
         poles = np.roots(self.polynomial)
         outside = np.abs(poles) >= 1
         inside = np.where(outside, 1 / np.conj(poles), poles)
-        # On the circle itself noise would grow for ever; a thousandth inside it does not.
+        # On the circle itself noise would grow without bound; slightly inside it does not.
         inside = inside * np.minimum(1.0, 0.999 / np.maximum(np.abs(inside), 1e-12))
         variance = self.variance / float(np.prod(np.abs(poles[outside]) ** 2))
         return ARFilter(np.real(np.poly(inside))[1:], variance)
@@ -108,7 +108,7 @@ class ARFilter(eqx.Module):
 
         filt = self.stabilised()
         slowest = max(np.abs(np.roots(filt.polynomial)), default=0.0)
-        # What the first samples remember of a start at zero has sunk to a ten-thousandth.
+        # The transient from the start at zero has decayed to 1e-4.
         settle = min(50_000, int(np.ceil(np.log(1e-4) / np.log(min(slowest, 0.9999))))) + 1
         lead = settle if filt.order else 0
         white = rng.standard_normal((*shape[:-1], shape[-1] + lead))
@@ -116,12 +116,12 @@ class ARFilter(eqx.Module):
         return np.asarray(noise)[..., lead:]
 
     def forgetting(self, samples: float, series: Sequence[Float[np.ndarray, " _"]]) -> "ARFilter":
-        """The filter with no pole whose memory is longer than that, its variance that of series.
+        """The filter with its slowest poles moved inward, and the variance re-estimated.
 
         **Arguments:**
 
-        - `samples`: after which what a pole remembers has sunk to 1/e.
-        - `series`: what the filter was estimated from.
+        - `samples`: longest time constant of a pole.
+        - `series`: from which the filter was estimated.
         """
         poles = np.roots(self.polynomial)
         longest = np.exp(-1 / max(samples, 1e-3))
@@ -138,13 +138,13 @@ class ARFilter(eqx.Module):
 
 
 def check_series(series: Sequence[Float[np.ndarray, " _"]], order: int, what: str) -> None:
-    """Refuses residuals that no noise filter of an order can be estimated from.
+    """Refuses residuals from which no noise filter of an order can be estimated.
 
     **Arguments:**
 
     - `series`: residuals, one array for each recording.
     - `order`: the highest order asked for.
-    - `what`: whose residuals, as a reader knows it.
+    - `what`: the name of the output in messages.
 
     **Raises:** `NoiseError`.
     """
@@ -166,12 +166,12 @@ def check_series(series: Sequence[Float[np.ndarray, " _"]], order: int, what: st
     if total - order * len(series) < 3 * (order + 1):
         raise NoiseError(
             f"{total} samples of {what} do not determine a noise filter of order {order}, which "
-            "wants four for each coefficient: lower the order or record longer"
+            "needs four for each coefficient: lower the order or record longer"
         )
     swing = max(float(np.ptp(x)) for x in series)
     if swing <= 1e-12 * max(float(np.abs(x).max()) for x in series):
         raise NoiseError(
-            f"the residual of {what} is constant, so there is no noise to model: use OEM, or see "
+            f"the residual of {what} is constant, so there is no noise to model: use OEM, or check "
             "whether its torque was recorded at all"
         )
 
@@ -186,15 +186,15 @@ def fit_ar(
 ) -> ARFilter:
     """The AR filter of one joint's residuals over several recordings, by Burg's method.
 
-    Stable by construction, since every reflection coefficient is below one; never across the ends
-    of recordings.
+    Stable by construction, since every reflection coefficient is below one. Products across the
+    ends of recordings are left out.
 
     **Arguments:**
 
     - `series`: residuals, `(samples,)` each.
     - `order`: number of coefficients; None to choose it by `criterion` over 0..`highest`.
-    - `white`: significance at which Ljung and Box's test of the innovations refuses an order, as
-      `orders` has it; None not to ask.
+    - `white`: significance of Ljung and Box's test of the innovations, by which orders are
+      rejected (see `orders`); None for no test.
 
     **Raises:** `NoiseError` for a given order that the data do not allow.
     """
@@ -228,14 +228,14 @@ def orders(
 
 
 def choose(table: "pd.DataFrame", criterion: Criterion, white: float | None = None) -> int:
-    """The order with the least criterion, among those whose innovations pass for white if any do.
+    """The order with the lowest criterion, among those with white innovations if there are any.
 
     (As CAPTAIN's `aic` does, Young 2011.)
 
     **Arguments:**
 
     - `table`: from `orders`.
-    - `white`: significance of the test; None to ask for the criterion alone.
+    - `white`: significance of the test; None for the criterion alone.
     """
     if white is not None:
         passing = table.loc[table["ljung_box_p"] > white]
@@ -246,8 +246,8 @@ def choose(table: "pd.DataFrame", criterion: Criterion, white: float | None = No
 class Burg(eqx.Module):
     """Filters of every order, pooled over series (Burg 1975).
 
-    Yule and Walker's equations have a bias that near the unit circle makes the variance several
-    times too large; no library pools several series.
+    The Yule-Walker equations are biased: for poles near the unit circle their variance is several
+    times too large. No library pools several series.
     """
 
     coefficients: list[np.ndarray]
@@ -279,7 +279,7 @@ class Burg(eqx.Module):
         return cls(found, floored, innovations, count)
 
     def orders(self, tested: bool, lags: int = 38) -> "pd.DataFrame":
-        """One row an order; whiteness only where `tested`, for it takes longer than the rest."""
+        """One row for each order; whiteness only where `tested`, since it is slow."""
         import pandas as pd
 
         k = np.arange(len(self.variances))

@@ -1,4 +1,4 @@
-"""Autoregressive noise of several joints at once, each driven by the past of all."""
+"""Autoregressive noise of several joints, each depending on the past of all."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -28,12 +28,12 @@ class VectorAR(eqx.Module):
 
     @property
     def outputs(self) -> int:
-        """How many joints."""
+        """Number of joints."""
         return len(self.covariance)
 
     @property
     def companion(self) -> Float[np.ndarray, "states states"]:
-        """The matrix that takes the last `order` values of the noise one sample further."""
+        """Companion matrix: maps the last `order` values of the noise to the next sample."""
         n, m = self.outputs, self.order
         matrix = np.eye(n * m, k=-n)
         matrix[:n] = -np.concatenate(list(self.coefficients), axis=1) if m else 0.0
@@ -110,8 +110,8 @@ def fit_var(
 ) -> VectorAR:
     """The vector AR filter of all joints' residuals, by Nuttall's and Strand's method.
 
-    The multichannel form of Burg's: stable, and never across the ends of recordings (Nuttall
-    1976, Strand 1977).
+    The multichannel form of Burg's method: stable, without products across the ends of recordings
+    (Nuttall 1976, Strand 1977).
 
     **Arguments:**
 
@@ -188,7 +188,7 @@ Noise = Sequence[ARFilter] | VectorAR | None
 def innovations(
     x: Float[np.ndarray, "samples outputs"], noise: Noise
 ) -> Float[np.ndarray, "samples outputs"]:
-    """Residuals through the inverse of noise filters; rows that need an unknown past are zero."""
+    """Residuals through the inverse of noise filters; rows with an unknown past are zero."""
     if noise is None:
         return x
     if isinstance(noise, VectorAR):

@@ -10,12 +10,12 @@ from jaxtyping import Float
 def autocovariance(
     series: Sequence[Float[np.ndarray, " _"]], lags: int
 ) -> Float[np.ndarray, " lags_and_zero"]:
-    """Autocovariance pooled over several series, never across their ends, from lag 0.
+    """Autocovariance pooled over several series, without products across their ends, from lag 0.
 
     **Arguments:**
 
     - `series`: residuals with mean zero, `(samples,)` each.
-    - `lags`: how many beyond lag 0.
+    - `lags`: number of lags beyond 0.
     """
     total = np.zeros(lags + 1)
     for x in series:
@@ -26,9 +26,9 @@ def autocovariance(
 
 
 def levelled(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]:
-    """Several series with the noise of each as strong as that of all together.
+    """Several series scaled to a common noise level.
 
-    One recording that is louder than the others would otherwise stand for all of them.
+    Otherwise one recording with more noise would dominate.
 
     **Arguments:**
 
@@ -38,7 +38,7 @@ def levelled(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]
 
 
 def levels(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]:
-    """How strong the noise of each series is beside that of all together; one where it has none."""
+    """Noise level of each series relative to that of all together; one for a series of zeros."""
     power = [np.asarray(np.mean(np.square(x), axis=0)) for x in series]
     pooled = sum(len(x) * p for x, p in zip(series, power, strict=True)) / sum(map(len, series))
     ratio = [np.where(p > 0, p, 1.0) / np.where(p > 0, pooled, 1.0) for p in power]
@@ -48,7 +48,7 @@ def levels(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]:
 def autocorrelation(
     series: Sequence[Float[np.ndarray, " _"]], lags: int = 38
 ) -> tuple[Float[np.ndarray, " lags_and_zero"], float]:
-    """Autocorrelation from lag 0, and the two-sigma bound that white residuals keep to.
+    """Autocorrelation from lag 0, and the two-sigma bound for white residuals.
 
     **Arguments:**
 
@@ -62,7 +62,7 @@ def autocorrelation(
 
 
 class LjungBox(eqx.Module):
-    """A test of whiteness: statistic, degrees of freedom, and the chance of as much by noise."""
+    """A test of whiteness: statistic, degrees of freedom, p-value."""
 
     statistic: float
     freedom: int
@@ -74,13 +74,13 @@ def ljung_box(
 ) -> LjungBox:
     """Whether residuals are white, over several recordings at once (Ljung and Box 1978).
 
-    statsmodels has the test for one series; pooled, each lag counts the pairs that recordings
-    hold, none across their ends, and each recording in units of its own level.
+    statsmodels has the test for one series. Here each lag pools the pairs within recordings, each
+    scaled to its own noise level.
 
     **Arguments:**
 
     - `series`: residuals with mean zero, `(samples,)` each.
-    - `lags`: how many.
+    - `lags`: number of lags.
     - `fitted`: coefficients that were estimated from them.
     """
     import scipy

@@ -1,6 +1,6 @@
-"""MATLAB's files of version 5, read without trust in what their headers say.
+"""MATLAB files of version 5, read without trusting their headers.
 
-SciPy's reader is C that follows those headers: one wrong bit in a flag ends the process. Layout as
+SciPy's reader is C code that does: one wrong bit in a flag can crash the process. Layout as
 in MathWorks' "MAT-File Format".
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 _MATRIX, _COMPRESSED = 14, 15
 _CHAR, _OPAQUE = 4, 17
-# What an array is by its class, and how its numbers are stored.
+# Classes of arrays, and types of stored numbers.
 _ODD = {1: "cell", 2: "struct", 3: "object", 5: "sparse", 16: "function", _OPAQUE: "opaque"}
 _CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
@@ -32,7 +32,7 @@ def order_of(data: bytes) -> str | None:
 def variables(
     data: bytes, order: str, largest: int, refuse: Callable[[int], Exception]
 ) -> Iterator[tuple[str, np.ndarray | str]]:
-    """Name and array of each variable, or the kind of one that is no array.
+    """Name and array of each variable, or the kind of a variable that is not an array.
 
     **Arguments:**
 
@@ -51,15 +51,15 @@ def variables(
                 raise refuse(largest - left)
             kind, content, _ = _element(content, 0, order)
         if kind != _MATRIX:
-            raise ValueError(f"a variable is of type {kind}, which is no array")
+            raise ValueError(f"a variable is of type {kind}, which is not an array")
         name, value = _matrix(content, order)
-        # MATLAB keeps what belongs to functions in a variable without a name.
+        # MATLAB stores data of functions in a variable without a name.
         if name:
             yield name, value
 
 
 def _element(data: bytes, at: int, order: str) -> tuple[int, bytes, int]:
-    """Type and content of a data element, and where the next one begins."""
+    """Type and content of a data element, and the position of the next."""
     if at + 8 > len(data):
         raise ValueError("the file ends in the middle of a variable")
     kind, size = struct.unpack_from(f"{order}II", data, at)
@@ -77,7 +77,7 @@ def _element(data: bytes, at: int, order: str) -> tuple[int, bytes, int]:
 
 
 def _unpacked(packed: bytes, most: int) -> bytes:
-    """What compressed bytes unpack to; one byte more than `most` if it is more than that."""
+    """Decompressed bytes; one more than `most` if there are more."""
     unpacker = zlib.decompressobj()
     content = unpacker.decompress(packed, most + 1)
     if len(content) <= most and not unpacker.eof:
@@ -105,11 +105,11 @@ def _matrix(data: bytes, order: str) -> tuple[str, np.ndarray | str]:
         stored, content, _ = _element(data, at, order)
         return name, _text(content, stored, shape, order)
     if kind not in _CLASSES:
-        raise ValueError(f"{name!r} is of class {kind}, which there is not")
+        raise ValueError(f"{name!r} is of class {kind}, which does not exist")
     real, at = _numbers(data, at, order, shape)
     if word & _COMPLEX:
         return name, real + 1j * _numbers(data, at, order, shape)[0]
-    # Numbers are stored as briefly as they fit: fractions without one as integers, never back.
+    # Whole numbers may be stored as integers, but fractions are never stored in an integer class.
     if not np.can_cast(real.dtype, _CLASSES[kind], "same_kind") and real.dtype.kind == "f":
         raise ValueError(f"{name!r} holds fractions where its class is of integers")
     return name, real.astype(_CLASSES[kind])
@@ -118,14 +118,14 @@ def _matrix(data: bytes, order: str) -> tuple[str, np.ndarray | str]:
 def _expected(data: bytes, at: int, order: str, kind: int) -> tuple[bytes, int]:
     found, content, after = _element(data, at, order)
     if found != kind:
-        raise ValueError(f"there is an element of type {found} where {kind} is due")
+        raise ValueError(f"there is an element of type {found} where {kind} is expected")
     return content, after
 
 
 def _numbers(data: bytes, at: int, order: str, shape: tuple[int, ...]) -> tuple[np.ndarray, int]:
     stored, content, after = _element(data, at, order)
     if stored not in _STORED:
-        raise ValueError(f"numbers are of type {stored}, which there is not")
+        raise ValueError(f"numbers are of type {stored}, which does not exist")
     values = np.frombuffer(content, f"{order}{_STORED[stored]}")
     if len(values) != math.prod(shape):
         raise ValueError(f"{len(values)} numbers are there where the shape is {shape}")
@@ -135,7 +135,7 @@ def _numbers(data: bytes, at: int, order: str, shape: tuple[int, ...]) -> tuple[
 def _text(content: bytes, stored: int, shape: tuple[int, ...], order: str) -> np.ndarray:
     """The rows of a matrix of characters."""
     if stored not in _TEXT:
-        raise ValueError(f"text is of type {stored}, which there is not")
+        raise ValueError(f"text is of type {stored}, which does not exist")
     coding = _TEXT[stored]
     if coding in ("utf-16", "utf-32"):
         coding += "-le" if order == "<" else "-be"

@@ -1,10 +1,10 @@
-"""How a complaint about a recording is worded."""
+"""Messages about recordings."""
 
 from ..errors import RecordingError, sentence
 
 
 def problem(source: str, what: str, remedy: str) -> RecordingError:
-    """The error for one problem: a single printable sentence, whatever the file holds.
+    """The error for one problem: one printable sentence, whatever the file contains.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""Finite Fourier series: periodic motion with its derivatives, and what repeats in a recording."""
+"""Finite Fourier series of periodic motion with derivatives, and means over periods."""
 
 import equinox as eqx
 import numpy as np
@@ -50,7 +50,7 @@ class FourierSeries(eqx.Module):
 
 
 class Harmonics(eqx.Module):
-    """What was settled for a recording: its period in s, and how many harmonics matter."""
+    """Period of a recording in s, and number of harmonics."""
 
     period: float = eqx.field(static=True)
     harmonics: int = eqx.field(static=True)
@@ -62,7 +62,7 @@ def _asked(recording: Recording) -> Float[np.ndarray, "samples joints"]:
 
 
 def _unrepeated(x: Float[np.ndarray, "samples joints"], lag: int) -> float:
-    """What is left of a motion when its like of `lag` samples ago is taken off, relative to it."""
+    """Relative difference between a motion and itself `lag` samples earlier."""
     spread = x.std(axis=0)
     moves = spread > 1e-9 * max(float(spread.max()), 1e-300)
     apart = np.sqrt(np.mean((x[lag:] - x[:-lag]) ** 2, axis=0))
@@ -79,7 +79,7 @@ def _interpolated(x: Float[np.ndarray, "samples joints"], lag: float) -> float:
 
 
 def period_of(recording: Recording, period: float | None = None) -> float:
-    """The period of a recorded motion, s, of which the recording must hold two.
+    """The period of a recorded motion, s; the recording must contain two.
 
     **Arguments:**
 
@@ -102,7 +102,7 @@ def period_of(recording: Recording, period: float | None = None) -> float:
                 f"{recording.name} lasts {recording.duration:.3g} s, less than its period of "
                 f"{period:g} s: give a recording of whole periods"
             )
-        # With one period only there is nothing to hold it against but its own ends.
+        # With only one period, its two ends are compared.
         x = resampled(recording.time, recording.q, even_times(recording))
         left = _unrepeated(x, lag) if n - lag > max(4, 0.05 * lag) else 0.0
         if left > _APERIODIC:
@@ -123,7 +123,7 @@ def period_of(recording: Recording, period: float | None = None) -> float:
     )
     differ = differ / x.shape[1]
     low = differ < max(2.0 * float(differ.min()), _APERIODIC**2)
-    # Slow motion differs little over short lags: a period shows after a lag at which it did.
+    # Slow motion differs little over short lags: look after the first large difference.
     far = int(np.argmax(differ > 0.5)) if np.any(differ > 0.5) else len(lags)
     low[:far] = False
     if not low.any() or float(differ[low].min()) > _APERIODIC**2:
@@ -138,17 +138,17 @@ def period_of(recording: Recording, period: float | None = None) -> float:
     fine = np.linspace(best - 1, best + 1, 201)
     fine = fine[(fine >= 1) & (fine < n - 2)]
     found = float(fine[int(np.argmin([_interpolated(x, lag) for lag in fine]))]) / rate
-    # A period of whole samples, where that is as good: references are made so.
+    # A whole number of samples is preferred where it fits as well: most references have one.
     if abs(found * rate - best) < 0.05:
         found = float(best / rate)
     return period_of(recording, found)
 
 
 def settle_harmonics(recording: Recording, period: float, harmonics: int | None) -> Harmonics:
-    """How many harmonics a recorded motion has, by BIC over all joints.
+    """Number of harmonics of a recorded motion, by BIC over all joints.
 
-    Each joint's errors weigh by their own variance: that of the encoder's step, Q²/12, or what
-    the largest series leaves, whichever is more.
+    Each joint's errors are weighted by their variance: that of the encoder's step, Q²/12, or the
+    residual of the largest series, whichever is larger.
 
     **Arguments:**
 
@@ -176,7 +176,7 @@ def settle_harmonics(recording: Recording, period: float, harmonics: int | None)
     x = resampled(recording.time, recording.q, time)
     most = min(most, 100)
     wide = fourier_basis(time, period, most)[0]
-    # Gram-Schmidt by Cholesky: the waves are all but orthogonal, and there are many samples.
+    # Gram-Schmidt by Cholesky: the waves are nearly orthogonal, and there are many samples.
     lower = scipy.linalg.cholesky(wide.T @ wide, lower=True)
     parts = scipy.linalg.solve_triangular(lower, wide.T @ x, lower=True) ** 2
     gained = np.concatenate([parts[:1], parts[1::2] + parts[2::2]])
@@ -192,11 +192,11 @@ def settle_harmonics(recording: Recording, period: float, harmonics: int | None)
 
 
 class Repeated(eqx.Module):
-    """What repeats in a recording, and how much varies from one period to the next.
+    """Mean over the periods of a recording, and the deviation between periods.
 
     - `q`, `tau`: means over the periods, `(samples, joints)`.
-    - `noise_q`, `noise_tau`: standard deviations of one sample, `(joints,)`; no model in them.
-    - `periods`: how many whole periods there were.
+    - `noise_q`, `noise_tau`: standard deviations of one sample, `(joints,)`, without a model.
+    - `periods`: number of whole periods.
     """
 
     q: Float[np.ndarray, "samples joints"]
@@ -243,7 +243,7 @@ def resampled_at(
     x: Float[np.ndarray, "samples columns"],
     at: Float[np.ndarray, " points"],
 ) -> Float[np.ndarray, "points columns"]:
-    """Even samples at times among them: as they are where the two coincide, else by a cubic."""
+    """Evenly sampled values at given times: exact at the samples, cubic between them."""
     import scipy
 
     place = (at - time[0]) / (time[1] - time[0])

@@ -1,4 +1,4 @@
-"""Zero-phase low-passes: how far up a recorded motion is signal, and the filter that keeps it."""
+"""Zero-phase low-pass filters, and the frequency up to which a recorded motion is signal."""
 
 import dataclasses
 import itertools
@@ -15,7 +15,7 @@ from ..recording import Recording
 Moving = Callable[[Recording, float], Bool[np.ndarray, "samples joints"] | None]
 
 ORDER = 4
-# Samples in a period of the cutoff: half of them reach to where the filter has a sixth left.
+# Samples in a period of the cutoff; at their Nyquist frequency the filter's gain is a sixth.
 _SAMPLES = 2.5
 
 
@@ -32,20 +32,20 @@ def low_pass(
     import scipy
 
     sections = scipy.signal.butter(order, cutoff, fs=rate, output="sos")
-    # SciPy's own choice of padding is shorter than the filter remembers, and then a signal that
-    # moves at its end is bent there. A straight line would pass unchanged, so it need not pass.
+    # SciPy's default padding is shorter than the filter's response and distorts a signal that moves
+    # at its end. A straight line passes unchanged, so it is taken off first.
     pad = min(len(x) - 1, int(np.ceil(4 * rate / cutoff)))
     line = np.linspace(x[0], x[-1], len(x))
     return line + scipy.signal.sosfiltfilt(sections, x - line, axis=0, padlen=pad)
 
 
 def even_times(recording: Recording) -> Float[np.ndarray, " samples"]:
-    """As many even times as a recording has samples, over the same span, s."""
+    """Evenly spaced times, as many as the recording has samples, over the same span, s."""
     return np.linspace(recording.time[0], recording.time[-1], recording.samples)
 
 
 def evened(recording: Recording) -> Recording:
-    """A recording on as many even times, all its signals by cubic splines; itself if it is even."""
+    """A recording resampled to evenly spaced times by cubic splines; unchanged if it is even."""
     time = even_times(recording)
     if np.allclose(recording.time, time, rtol=0, atol=1e-6 * (time[1] - time[0])):
         return recording
@@ -77,12 +77,12 @@ def smooth_motion(
 
 
 def signal_cutoff(recording: Recording) -> float:
-    """The frequency in Hz above which a recorded motion says no more about acceleration.
+    """The frequency in Hz above which a recorded motion does not determine acceleration.
 
-    The spectrum of the acceleration, f⁴ times that of position, falls until the encoder's noise
-    lifts it again: its lowest point, all joints together, each relative to its speed. At least
-    five times where speed is strongest, at most an eighth of the sample rate; a tenth of that where
-    the recording is too short for a spectrum.
+    The spectrum of the acceleration, f⁴ times that of position, decreases until the encoder's noise
+    raises it again. The result is its minimum, summed over joints relative to their speed. It is at
+    least five times the frequency of largest speed and at most an eighth of the sample rate. For
+    recordings too short for a spectrum it is a tenth of the sample rate.
     """
     import scipy
 
@@ -90,17 +90,17 @@ def signal_cutoff(recording: Recording) -> float:
     if n < 200:
         return rate / 10
     q = scipy.signal.detrend(resampled(recording.time, recording.q, even_times(recording)), axis=0)
-    # A window whose side lobes stay below the noise, for the motion is 10¹⁰ times as strong.
+    # The window's side lobes must be below the noise: the motion is 10¹⁰ times as strong.
     window = np.asarray(scipy.signal.get_window("blackmanharris", n))[:, None]
     power = np.abs(np.fft.rfft(q * window, axis=0)) ** 2
     f = np.fft.rfftfreq(n, 1 / rate)
     rates = power * f[:, None] ** 2
     speed = rates.sum(axis=0)
-    # A joint that stands still shows its encoder's steps alone, and has nothing to say.
+    # A joint that stands still shows only its encoder's steps, and is left out.
     moves = rates[f < rate / 10].sum(axis=0) > speed / 2
     chosen = moves if moves.any() else speed > 0
     acceleration = f**4 * (power[:, chosen] / speed[chosen]).sum(axis=1)
-    # Twenty bands, a third of an octave or so: a single line of a spectrum says little.
+    # About twenty bands of a third of an octave: single lines of a spectrum are too noisy.
     edges = np.unique(np.round(np.geomspace(4, n // 2, 20)).astype(int))
     bands = list(itertools.pairwise(edges))
     centre = np.array([f[low:high].mean() for low, high in bands])
@@ -111,15 +111,15 @@ def signal_cutoff(recording: Recording) -> float:
 
 
 class Band(eqx.Module):
-    """The part of signals that is compared: frequencies, by a zero-phase filter, and samples.
+    """The frequencies and samples of signals that are compared.
 
-    Samples are as far apart as the low-pass allows: a likelihood of samples that follow each other
-    faster would be one of rounding, for above the cutoff there is next to nothing.
+    Samples are as far apart as the low-pass allows. Closer samples would make the likelihood depend
+    on rounding errors, since there is almost no power above the cutoff.
 
     - `gain`: the filter's at the frequencies of a real Fourier transform.
-    - `rows`: the samples that are left, far enough from the ends; `keep` says which are there.
-    - `moving`: in which of these rows a joint moves; in the others nothing of it is compared, and
-      its signals are zero. None where all rows count.
+    - `rows`: the samples that are compared, far enough from the ends; `keep` marks those present.
+    - `moving`: rows in which a joint moves; in the others it is not compared and its signals are
+      zero. None where all rows count.
     """
 
     gain: Float[Array, "recordings frequencies"]
@@ -135,7 +135,7 @@ class Band(eqx.Module):
         samples: int,
         moving: Moving = lambda recording, cutoff: None,
     ) -> "Band":
-        """The band of recordings that are padded to `samples`.
+        """The band of recordings padded to `samples`.
 
         **Arguments:**
 
@@ -143,7 +143,7 @@ class Band(eqx.Module):
         - `moving`: at which samples of a recording joints move, `(samples, joints)`, below a
           cutoff, Hz; None for all.
 
-        **Raises:** `RecordingError` where a recording is over before the filter has settled.
+        **Raises:** `RecordingError` where a recording is shorter than the filter's settling time.
         """
         import scipy
 
@@ -173,7 +173,7 @@ class Band(eqx.Module):
     def __call__(
         self, x: Float[Array, "recordings samples *axes"]
     ) -> Float[Array, "recordings rows *axes"]:
-        """Signals, zero where there is no sample, through the filter; zero where no row is."""
+        """Filtered signals, with zeros for missing samples and rows."""
         axes = (1,) * (x.ndim - 2)
         size = 2 * (self.gain.shape[1] - 1)
         wave = jnp.fft.rfft(x, size, axis=1) * self.gain.reshape(*self.gain.shape, *axes)
@@ -186,5 +186,5 @@ class Band(eqx.Module):
     def picked(
         self, x: Shaped[Array, "recordings samples *axes"]
     ) -> Shaped[Array, "recordings rows *axes"]:
-        """The rows that are left of signals."""
+        """The compared rows of signals."""
         return x[jnp.arange(len(self.rows))[:, None], self.rows]

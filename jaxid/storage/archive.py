@@ -1,7 +1,7 @@
-"""Results as bytes and back: JSON and NumPy arrays in a zip, nothing in them executed.
+"""Results as bytes and back: JSON and NumPy arrays in a zip, without executable content.
 
 The zip holds `manifest.json`, its SHA-256 in `manifest.sha256`, and `0.npy`, `1.npy`, … for the
-arrays. Members are stored, not compressed: what such a file unpacks to cannot be larger than it.
+arrays. Members are stored without compression, so a file cannot unpack to more than its own size.
 The manifest lists modules as class name and fields, each after those it refers to.
 """
 
@@ -27,11 +27,11 @@ from .classes import Registry, agrees, hints, origin, rebuilt
 if TYPE_CHECKING:
     import pandas as pd
 
-# Raised whenever an older jaxid could not read what this one writes. Older formats stay readable: a
-# class whose fields meant something else has a method `of_format(format)` that gives the object of
-# now, and one whose fields had other names `fields_of_format(fields, format)`. 2: what a loop holds
-# or frees is kept by place, no longer by name. 3: the smoothing of a sign is a speed, not one over
-# it.
+# Increased whenever an older jaxid could not read the new files. Older formats stay readable: a
+# class whose fields changed their meaning has `of_format(format)`, which converts the object; one
+# whose fields changed their names has `fields_of_format(fields, format)`. 2: a loop stores held and
+# freed parameters by place instead of by name. 3: the smoothing of a sign is a speed instead of its
+# inverse.
 FORMAT = 3
 
 # Everything but arrays; a story of many steps has about one megabyte.
@@ -40,7 +40,7 @@ _PACKAGES = ("jaxid-robotics", "jax", "jaxlib", "equinox", "diffrax", "numpy", "
 
 
 def versions() -> dict[str, str]:
-    """The versions that a result depends on."""
+    """Versions of the packages that a result depends on."""
     found = {}
     for package in _PACKAGES:
         try:
@@ -72,22 +72,22 @@ def pack(value: Any) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name, content in members.items():
-            # A date would make two equal results differ.
+            # With a date, equal results would give different files.
             archive.writestr(zipfile.ZipInfo(name), content)
     return buffer.getvalue()
 
 
 class _Packer:
-    """Turns values into JSON, and collects modules and arrays, each once."""
+    """Converts values to JSON, and collects each module and array once."""
 
     def __init__(self) -> None:
         self.objects: list[dict[str, Any]] = []
         self.arrays: list[tuple[str, bytes]] = []
-        # The tree keeps what it holds alive, so that an identity stays one.
+        # The tree keeps its objects alive, so identities stay unique.
         self._seen: dict[int, Any] = {}
 
     def node(self, value: Any, where: str) -> Any:
-        """The JSON of a value; `where` names it in a complaint."""
+        """The JSON of a value; `where` names it in error messages."""
         import pandas as pd
 
         match value:
@@ -135,7 +135,7 @@ class _Packer:
             try:
                 fields[field.name] = self.node(held, f"{where}.{field.name}")
             except SaveError:
-                # A function or the like: it comes back where the class itself gives it.
+                # A function or the like: it is restored from the class's default.
                 if held is not field.default:
                     raise
         self.objects.append({"class": name, "package": package, "fields": fields})
@@ -173,7 +173,7 @@ def unpack(content: bytes, source: str, registry: Registry) -> Any:
     **Arguments:**
 
     - `content`: the bytes of the file. `source`: what messages call it.
-    - `registry`: the classes that may be in it; no others are looked for, and nothing is imported.
+    - `registry`: the classes that it may contain; no others are accepted, and nothing is imported.
 
     **Raises:** `SaveError` for whatever is wrong with the file.
     """
@@ -181,7 +181,7 @@ def unpack(content: bytes, source: str, registry: Registry) -> Any:
         return _Unpacker(source, registry).read(content)
     except SaveError:
         raise
-    # What a forged file makes constructors raise is theirs to choose.
+    # Constructors may raise any exception for a forged file.
     except Exception as error:
         raise _complaint(
             source,
@@ -224,7 +224,7 @@ class _Unpacker:
             entries = archive.infolist()
             if any(e.compress_type != zipfile.ZIP_STORED or e.flag_bits & 1 for e in entries):
                 raise self._damaged("it was packed again by another program")
-            # Entries that share their bytes unpack to more than the file has.
+            # Entries that share bytes would unpack to more than the file's size.
             if sum(e.file_size for e in entries) > len(content):
                 raise self._damaged("it would unpack to more than its own size")
             if len({e.filename for e in entries}) < len(entries):
@@ -232,14 +232,14 @@ class _Unpacker:
             members = {e.filename: archive.read(e) for e in entries}
         except SaveError:
             raise
-        except Exception as error:  # zipfile raises nearly anything on broken files
+        except Exception as error:  # zipfile may raise any exception for broken files
             raise _complaint(
                 self.source,
-                f"is cut off, damaged or no saved result ({type(error).__name__}: {error})",
+                f"is cut off, damaged or not a saved result ({type(error).__name__}: {error})",
                 "save or copy it again",
             ) from error
         if "manifest.json" not in members:
-            raise _complaint(self.source, "is a zip but no saved result", "check its name")
+            raise _complaint(self.source, "is a zip but not a saved result", "check its name")
         return members
 
     def _check_format(self, manifest: Any) -> None:
@@ -270,7 +270,7 @@ class _Unpacker:
     def _class(self, package: str, name: str) -> type:
         found = self.registry.get((package, name))
         if found is None and package not in ("", "diffrax"):
-            # A class of the user's, which may have moved to another file of theirs.
+            # A user's class, which may have moved to another module.
             same = [c for (p, n), c in self.registry.items() if p and n == name]
             found = same[0] if len(same) == 1 else None
         if found is None and package not in ("", "diffrax"):
@@ -297,7 +297,7 @@ class _Unpacker:
             if name not in fields:
                 raise _complaint(
                     self.source,
-                    f"holds {cls.__name__} with a field {name}, which it does not have here",
+                    f"holds {cls.__name__} with a field {name}, which this version does not have",
                     "load it with the version that wrote it",
                 )
         made = rebuilt(cls, given)
@@ -305,11 +305,11 @@ class _Unpacker:
             made = made.of_format(self.format)
         for name, hint in hints(cls).items():
             if name in fields and not agrees(getattr(made, name), hint):
-                raise self._damaged(f"{cls.__name__}.{name} is not what it should be")
+                raise self._damaged(f"{cls.__name__}.{name} is of a wrong type")
         return made
 
     def value(self, node: Any) -> Any:
-        """What a node of the manifest stands for."""
+        """The object of a node of the manifest."""
         match node:
             case None | bool() | int() | float() | str():
                 return node
@@ -333,10 +333,10 @@ class _Unpacker:
                     return cls[member]
             case {"frame": frame, "columns": columns, "index": index, "names": names}:
                 return self._frame(frame, columns, index, names)
-        raise self._damaged("its manifest holds something of no known kind")
+        raise self._damaged("its manifest holds an unknown kind of node")
 
     def _on_device(self, k: int) -> jax.Array:
-        # What shared an array shares it again.
+        # Objects that shared an array share it again.
         if k not in self._device:
             self._device[k] = jnp.asarray(self.arrays[k])
         return self._device[k]

@@ -1,4 +1,4 @@
-"""Arrays in the bytes of a `.npy`, which are not trusted."""
+"""Arrays from the bytes of untrusted `.npy` files."""
 
 import io
 import math
@@ -7,11 +7,11 @@ import numpy as np
 
 
 def npy(content: bytes) -> np.ndarray:
-    """The array in the bytes of a `.npy`, whose header must tell the truth about their number.
+    """The array in the bytes of a `.npy`; the size in the header must match the bytes.
 
-    `numpy.load` sets aside whatever a header asks for before it reads.
+    `numpy.load` allocates whatever size the header claims before it reads.
 
-    **Raises:** `ValueError` where it does not, or for Python objects.
+    **Raises:** `ValueError` for another size, or for Python objects.
     """
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)

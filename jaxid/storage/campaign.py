@@ -1,4 +1,4 @@
-"""Long work in pieces: each finished one is a file, and who is killed goes on where it was."""
+"""Long computations in pieces: each finished piece is saved, so a killed run can continue."""
 
 import contextlib
 import hashlib
@@ -34,28 +34,28 @@ from .saved import registry
 
 try:
     import fcntl
-except ImportError:  # Windows has other locks; there nobody watches over a second process
+except ImportError:  # Windows has other locks; there a second process is not detected
     fcntl = None
 
-# What a computation says about its input, alike in every run; anything else is not its result.
+# Errors that depend on the input only, and are the same in every run; others are not results.
 _VERDICTS = (JaxidError, ArithmeticError, np.linalg.LinAlgError)
-# Pieces that a worker does before a new one takes its place: it keeps every program that it has
-# compiled. (The executor's own max_tasks_per_child can wait for ever, CPython issue 115634.)
+# Pieces that a worker computes before it is replaced: it keeps every program that it compiled.
+# (The executor's max_tasks_per_child can deadlock, CPython issue 115634.)
 LIFE = 10
 
 
 class Failed(eqx.Module):
-    """What a piece gave that could not be computed: why, in words."""
+    """Result of a piece that could not be computed: the reason."""
 
     reason: str = eqx.field(static=True)
 
 
 class Campaign:
-    """A folder of finished pieces of one piece of work.
+    """A folder with the finished pieces of one long computation.
 
-    Every piece is written at once under another name and moved to its own, with checksums; what
-    was written is never computed again, and what is damaged is set aside and computed anew. One
-    process at a time works in a folder.
+    Every finished piece is written with checksums, under a temporary name and then renamed. A piece
+    that was written is not computed again; a damaged one is set aside and computed again. Only one
+    process at a time may use a folder.
 
     Used as a context:
 
@@ -66,12 +66,12 @@ class Campaign:
 
     **Arguments:**
 
-    - `folder`: made where it is not there; None to keep nothing.
-    - `plan`: what the pieces follow from: seeds, settings, models, recordings. A folder is gone on
-      with only for the same plan and the same versions of jaxid and what it stands on.
+    - `folder`: created if it does not exist; None to save nothing.
+    - `plan`: all that determines the pieces: seeds, settings, models, recordings. A folder is
+      continued only with the same plan and the same versions of jaxid and its dependencies.
     - `classes`: modules of your own that pieces may hold.
 
-    **Raises:** `SaveError` where the folder belongs to other work, or another process is at it.
+    **Raises:** `SaveError` where the folder belongs to another plan or is in use.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class Campaign:
         self._drop_lock()
 
     def piece(self, name: str, work: Callable[[], Any]) -> Any:
-        """What a piece gave: read where it is there, else computed and written.
+        """The result of a piece: read if it was saved, otherwise computed and saved.
 
         **Arguments:**
 
@@ -134,17 +134,17 @@ class Campaign:
         jobs: int = 1,
         executor: Executor | None = None,
     ) -> Iterator[tuple[str, Any]]:
-        """Name and result of every piece: those that are there first, then the others as they end.
+        """Name and result of every piece: saved ones first, then the others as they finish.
 
-        A piece that raises an error of jaxid's, or of arithmetic, gives a `Failed`, and the others
-        go on.
+        A piece that raises an error of jaxid or of arithmetic gives a `Failed`; others continue.
 
         **Arguments:**
 
         - `work`: from an argument to a result; with several jobs, a function of a module.
         - `pieces`: arguments by name.
-        - `jobs`: processes that work at the same time.
-        - `executor`: where to work instead; what its workers cannot do gives a `Failed`.
+        - `jobs`: number of parallel processes.
+        - `executor`: used instead of processes; pieces that its workers cannot compute give a
+          `Failed`.
         """
         left = {}
         for name, argument in pieces.items():
@@ -164,7 +164,7 @@ class Campaign:
     # --- one piece ------------------------------------------------------------------------------
 
     def path(self, name: str) -> Path:
-        """Where a piece is written."""
+        """The file of a piece."""
         assert self.folder is not None
         readable = re.sub(r"[^A-Za-z0-9+._-]+", "_", name)[:80].strip(".")
         return self.folder / f"{readable}-{hashlib.sha256(name.encode()).hexdigest()[:12]}.piece"
@@ -180,14 +180,14 @@ class Campaign:
             if held["piece"] != name or held["plan"] != self._key:
                 raise SaveError("of another plan")
         except (SaveError, KeyError, TypeError):
-            # Kept for whoever wants to know what happened to it, out of the way of a new one.
+            # Kept under another name for inspection.
             path.replace(path.with_suffix(".damaged"))
             self.damaged.append(name)
             return False, None
         return True, held["value"]
 
     def _keep(self, name: str, value: Any) -> Any:
-        # What a catalogue's own functions made can be read back by whoever has made it once.
+        # Effects made by a catalogue's functions can be read once their classes are known.
         self._classes |= classes_of(value)
         if self.folder is not None and not isinstance(value, _Died):
             content = archive.pack({"piece": name, "plan": self._key, "value": value})
@@ -199,7 +199,7 @@ class Campaign:
     def _in_executor(
         self, work: Callable[[Any], Any], left: Mapping[str, Any], executor: Executor
     ) -> Iterator[tuple[str, Any]]:
-        """Only this process writes; a worker that is lost takes its own piece with it alone."""
+        """Only this process writes; if a worker is lost, only its own piece fails."""
         running = {executor.submit(_tried, work, given): name for name, given in left.items()}
         try:
             for future in as_completed(running):
@@ -213,7 +213,7 @@ class Campaign:
     def _in_processes(
         self, work: Callable[[Any], Any], left: Mapping[str, Any], jobs: int
     ) -> Iterator[tuple[str, Any]]:
-        """Only this process writes: what a killed one has left running cannot do a piece again."""
+        """Only this process writes, so workers left over from a killed run cannot interfere."""
         ended: set[str] = set()
         try:
             names = list(left)
@@ -223,7 +223,7 @@ class Campaign:
                     ended.add(name)
                     yield name, self._keep(name, value)
         except BrokenProcessPool:
-            # One of them took its process down; which, shows when each works alone.
+            # One of them ended its process; each is tried alone to find out which.
             for name in [name for name in left if name not in ended]:
                 try:
                     [(_, value)] = _from_pool(work, {name: left[name]}, 1)
@@ -276,18 +276,18 @@ class Campaign:
             changed += ["format"] if had["format"] != plan["format"] else []
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise _problem(
-                path, f"is no plan of a campaign ({error!r})", "give another folder"
+                path, f"is not a plan of a campaign ({error!r})", "give another folder"
             ) from error
         if changed:
             raise _problem(
                 self.folder,
-                f"holds the pieces of other work (not the same: {', '.join(changed)})",
-                "give another folder, or what it was begun with",
+                f"holds the pieces of another computation (different: {', '.join(changed)})",
+                "give another folder, or the inputs that it was begun with",
             )
 
 
 class _Died(Failed):
-    """A failure that says nothing about the piece: the next run tries it again."""
+    """A failure that is not caused by the piece: the next run tries it again."""
 
 
 def _problem(path: Path, what: str, remedy: str) -> SaveError:
@@ -295,7 +295,7 @@ def _problem(path: Path, what: str, remedy: str) -> SaveError:
 
 
 def _described(value: Any) -> dict[str, str]:
-    """A part of a plan, to be compared and, shortly, to be read."""
+    """A short, comparable text for a part of a plan."""
     return {
         "sha256": hashlib.sha256(archive.pack(value)).hexdigest(),
         "shown": reprlib.Repr().repr(value),
@@ -342,7 +342,7 @@ def _from_pool(
 
 
 def _end_with_parent() -> None:
-    """Ends this worker when the process that started it is gone; Ctrl-C is for that one."""
+    """Ends this worker when its parent process ends, and leaves Ctrl-C to the parent."""
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()

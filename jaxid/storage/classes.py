@@ -1,4 +1,4 @@
-"""Classes by the names that they have in files, and their objects rebuilt of their fields."""
+"""Names of classes in files, and objects rebuilt from their fields."""
 
 import dataclasses
 import enum
@@ -16,19 +16,19 @@ Registry = Mapping[tuple[str, str], type]
 
 
 def origin(cls: type) -> tuple[str, str]:
-    """How a class is called in a file: its package and name; a user's own, its module and name."""
+    """The name of a class in a file: package and name; for a user's class, module and name."""
     package = cls.__module__.partition(".")[0]
     where = {"jaxid": "", "diffrax": "diffrax"}.get(package, cls.__module__)
     return where, cls.__name__
 
 
 def registered(classes: Iterable[type]) -> dict[tuple[str, str], type]:
-    """Classes by the names they have in files."""
+    """Classes by their names in files."""
     return {origin(cls): cls for cls in classes}
 
 
 def classes_of(tree: Any) -> set[type]:
-    """The classes of all modules in a tree: what restoring it takes."""
+    """The classes of all modules in a tree, which restoring it requires."""
     found: set[type] = set()
     waiting = [tree]
     while waiting:
@@ -46,9 +46,9 @@ def classes_of(tree: Any) -> set[type]:
 
 
 def rebuilt(cls: type, given: Mapping[str, Any]) -> Any:
-    """An object of its fields as they were, past converters and with the checks that follow them.
+    """An object from its saved fields, without converters but with the checks after them.
 
-    A field that the file does not know, for it is older, has its default.
+    A field that an older file does not contain gets its default.
     """
     made = object.__new__(cls)
     for field in dataclasses.fields(cls):
@@ -68,7 +68,7 @@ def rebuilt(cls: type, given: Mapping[str, Any]) -> Any:
 
 
 def _or_default(value: Any, default: Any) -> Any:
-    """The default itself where the value is the same: equinox prints a field that `is` not it."""
+    """The default object itself if the value is equal, since equinox hides fields by identity."""
     if type(value) is not type(default):
         return value
     if isinstance(value, (str, int, float)):
@@ -89,7 +89,7 @@ def hints(cls: type) -> dict[str, Any]:
 
 
 def agrees(value: Any, hint: Any) -> bool:
-    """Whether a value may stand in a field with that annotation; what is not known may."""
+    """Whether a value fits a field's annotation; True if the annotation is not known."""
     if hint in (Any, None) or isinstance(hint, (str, typing.TypeVar)):
         return hint is not None or value is None
     made_of, of = typing.get_origin(hint), typing.get_args(hint)
@@ -105,7 +105,7 @@ def agrees(value: Any, hint: Any) -> bool:
         return len(of) == len(value) and all(map(agrees, value, of))
     plain = made_of or hint
     if plain in (int, float) or hasattr(plain, "array_type"):
-        # A number of a module becomes an array, and an array one of more axes, under `vmap`.
+        # Under `vmap` a number becomes an array, and an array gets more axes.
         numbers = (int, float, np.ndarray, jax.Array)
         return isinstance(value, numbers) and not isinstance(value, bool)
     if isinstance(plain, type):

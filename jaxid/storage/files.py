@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Atomic writing of files."""
 
 import contextlib
 import os
@@ -9,17 +9,17 @@ from ..errors import SaveError, sentence
 
 
 def write_whole(path: str | os.PathLike[str], content: bytes) -> Path:
-    """Writes a file under another name first, so that who is killed meanwhile leaves the old one.
+    """Writes a file under a temporary name and renames it, so an interruption keeps the old file.
 
     **Arguments:**
 
-    - `path`: its folder must exist; a file that is there is replaced.
-    - `content`: all of it.
+    - `path`: its folder must exist; an existing file is replaced.
+    - `content`: bytes of the whole file.
 
     **Raises:** `SaveError` where it cannot be written.
     """
     path = Path(path)
-    # In the same folder: a name can be moved at once only within one file system.
+    # In the same folder: renaming is atomic only within one file system.
     draft = path.parent / f".{secrets.token_hex(8)}.part"
     try:
         with open(draft, "xb") as file:

@@ -15,17 +15,17 @@ from . import archive
 from .classes import registered
 from .files import write_whole
 
-# Larger than any story of a day's recordings, and small enough to be read on a laptop.
+# Larger than any result of a day's recordings, and small enough to be read on a laptop.
 LARGEST = 4 * 2**30
 
 
 def save(result: eqx.Module, path: str | os.PathLike[str]) -> Path:
-    """Writes a result to one file, which is there whole or not at all.
+    """Writes a result to one file, atomically.
 
     **Arguments:**
 
     - `result`: a fit, comparison, diagnosis, discovery or loop.
-    - `path`: by convention with the ending `.jaxid`; a file that is there is replaced.
+    - `path`: by convention with the ending `.jaxid`; an existing file is replaced.
 
     **Returns:** the path.
 
@@ -39,7 +39,7 @@ def load(
 ) -> Any:
     """Reads what `save` wrote: the same result, whose methods work as before.
 
-    Nothing in the file is executed, and no class is looked for but jaxid's own and those given.
+    Nothing in the file is executed. Only jaxid's own classes and those given are accepted.
 
     **Arguments:**
 
@@ -62,7 +62,7 @@ def load(
                     f"pass largest={size} if it is yours",
                 )
             )
-        # One byte more than asked for shows a file that grows, or a device without an end.
+        # One byte more than the size reveals a growing file or an endless device.
         with open(path, "rb") as file:
             content = file.read(size + 1)
     except (OSError, ValueError, MemoryError) as error:
@@ -71,14 +71,14 @@ def load(
         ) from error
     if len(content) != size:
         raise SaveError(
-            sentence(source, "is no plain file, or is being written", "give a saved result")
+            sentence(source, "is not a plain file, or is being written", "give a saved result")
         )
     return archive.unpack(content, source, registry(classes))
 
 
 def registry(classes: Iterable[type] = ()) -> dict[tuple[str, str], type]:
     """The classes that a file may hold: jaxid's own, diffrax's steps, and those given."""
-    # `import jaxid` leaves these rooms for later, and only what was imported is found below.
+    # `import jaxid` imports these modules lazily, and only imported classes are found below.
     for room in ("discovery", "excitation"):
         importlib.import_module(f"jaxid.{room}")
     loaded = _below(eqx.Module) | _below(enum.Enum)
@@ -89,7 +89,7 @@ def registry(classes: Iterable[type] = ()) -> dict[tuple[str, str], type]:
 
 
 def _below(cls: type) -> set[type]:
-    """All subclasses that were imported."""
+    """All imported subclasses."""
     found: set[type] = set()
     waiting = [cls]
     while waiting:

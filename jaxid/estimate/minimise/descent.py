@@ -26,7 +26,7 @@ class BoundedDescent(optx.AbstractDescent):
     """Levenberg and Marquardt's step, in which bounds hold and initial states are eliminated.
 
     Damping is one over the step size, scaled by the largest columns of J met so far (Moré 1978).
-    A parameter that would leave its bounds stops there, and the others make up for it.
+    A parameter that would leave its bounds stops there, and the others compensate.
 
     **Arguments:**
 

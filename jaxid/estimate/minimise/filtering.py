@@ -14,7 +14,7 @@ def known_rows(
     kept: Bool[Array, "recordings samples"],
     before: Int[Array, " recordings"],
 ) -> Bool[Array, "recordings samples outputs"]:
-    """Which filtered rows need nothing from before the first sample, which nobody knows.
+    """Filtered rows that do not depend on values before the first sample.
 
     **Arguments:**
 

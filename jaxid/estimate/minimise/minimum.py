@@ -27,15 +27,15 @@ from .stock import Transformed
 
 
 class Stopping(eqx.Module):
-    """When a minimisation ends, and by which solver.
+    """Stopping criteria and solver of a minimisation.
 
     **Arguments:**
 
-    - `tolerance`: it stops when a step is shorter than this many standard deviations, or
-    - `worth`: when five steps together lower the loss by less than this share.
+    - `tolerance`: stops when a step is shorter than this many standard deviations.
+    - `worth`: stops when five steps together lower the loss by less than this share.
     - `max_steps`: largest number of points evaluated, refused ones included.
-    - `deadline`: of `time.perf_counter`, looked at before every step.
-    - `solver`: of optimistix, in place of jaxid's; it has tolerances of its own.
+    - `deadline`: of `time.perf_counter`, checked before every step.
+    - `solver`: of optimistix, instead of jaxid's, with its own tolerances.
     """
 
     tolerance: float = 1e-2
@@ -46,10 +46,10 @@ class Stopping(eqx.Module):
 
 
 class Minimum(eqx.Module):
-    """Where a minimisation ended.
+    """Result of a minimisation.
 
-    - `iterations`: how many points were evaluated.
-    - `notes`: what else there is to say of how it ended.
+    - `iterations`: number of evaluated points.
+    - `notes`: remarks on the result.
     """
 
     point: Point
@@ -71,8 +71,8 @@ def minimise(
     **Arguments:**
 
     - `theta`, `start`: where to start, `(parameters,)` and `(recordings, 2 · joints)`.
-    - `say`: told about every step.
-    - `known`: the linearisation at the start, where there is one already.
+    - `say`: called with a line for every step.
+    - `known`: the linearisation at the start, if it exists.
     """
     if settings.solver is not None:
         return _by_stock_solver(problem, theta, start, settings, say)
@@ -100,7 +100,7 @@ def descend(
     settings: Stopping,
     say: Callable[[str], None] = silent,
 ) -> tuple[Any, Status, int]:
-    """Steps to a minimum of what is evaluated outside the solver, with what was found there.
+    """Minimises a function that is evaluated outside the solver; returns the final evaluation.
 
     **Arguments:**
 
@@ -154,7 +154,7 @@ _BY_RESULT = {
 
 
 def _words(name: str) -> str:
-    """A result of diffrax in its own words."""
+    """The message of a diffrax result."""
     return diffrax.RESULTS[getattr(diffrax.RESULTS, name)]
 
 
@@ -171,7 +171,7 @@ def _by_stock_solver(
     settings: Stopping,
     say: Callable[[str], None],
 ) -> Minimum:
-    """The minimum that another solver of optimistix finds."""
+    """The minimum found by another solver of optimistix."""
     around, posed = linearisation(problem), Transformed.of(problem, start)
     point = around(theta, start)
     if not np.isfinite(point.loss):
@@ -198,7 +198,7 @@ def _by_stock_solver(
     notes = ()
     if result != optx.RESULTS.successful:
         status, notes = Status.stalled, (f"{type(solver).__name__}: {optx.RESULTS[result]}",)
-    # Some solvers remember the best point that they met, which is not the last.
+    # Some solvers return their best point, which is not the last.
     z, _, _ = solver.postprocess(fn, z, aux, None, {}, state, tags, result)
     point = around(*posed.inside(z))
     return Minimum(point, status, k, notes)

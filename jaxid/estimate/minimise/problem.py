@@ -72,7 +72,7 @@ class Sums(eqx.Module):
 
         **Arguments:**
 
-        - `loss`: infinite where the point is no good.
+        - `loss`: infinite where the point is not acceptable.
         """
         _, gram, slope, start_gram, start_slope, cross = self.added()
         return Products(loss / 2, (slope, start_slope), Arrow(gram, start_gram, cross))
@@ -109,7 +109,7 @@ class Point(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """Which residual is minimised, and where its parameters may go.
+    """The residual that is minimised, and the bounds of its parameters.
 
     - `free`: one for recordings whose initial state is estimated, else zero.
     - `mesh`: devices that share the recordings; None for one.
@@ -134,7 +134,7 @@ class Problem(eqx.Module):
 
     @property
     def rows(self) -> int:
-        """How many residuals there are, padding not counted."""
+        """Number of residuals without padding."""
         return int(np.sum(np.asarray(self.batch.kept))) * self.weights.shape[0]
 
     def unknowns(
@@ -142,7 +142,7 @@ class Problem(eqx.Module):
         theta: Float[Any, " parameters"],
         start: Float[Any, "recordings initials"],
     ) -> Unknowns:
-        """What a solver looks for: parameters, and initial states where they are estimated."""
+        """The unknowns: parameters, and initial states where they are estimated."""
         estimated = start if self.free_start else jnp.zeros((0, 0))
         return jnp.asarray(theta), jnp.asarray(estimated)
 
@@ -151,7 +151,7 @@ class Problem(eqx.Module):
         kept: Bool[Array, "recordings samples"],
         before: Int[Array, " recordings"] | None = None,
     ) -> Bool[Array, "recordings samples outputs"]:
-        """Which filtered rows need nothing from before the first sample, which nobody knows.
+        """Filtered rows that do not depend on values before the first sample.
 
         **Arguments:**
 
@@ -208,12 +208,12 @@ class Problem(eqx.Module):
         """The point of a linearisation."""
         loop = self.loop.with_theta(theta[: self.loop.theta.shape[0]])
         sums = Sums.of(found, self.free)
-        # By the squares: a loop close to running away has derivatives that are finite and useless.
+        # Squares overflow for a nearly diverging loop, whose derivatives are finite but useless.
         sound = jnp.isfinite(jnp.sum(sums.gram)) & jnp.isfinite(jnp.sum(sums.start_gram))
         loss = jnp.sum(sums.loss)
         sound = sound & jnp.isfinite(loss)
         if not imposed(loop):
-            # A motion that is given takes a torque of any inertia; to move, an arm needs mass.
+            # Inverse dynamics works for any inertia; a simulation needs a positive one.
             sound = sound & (loop.arm.smallest_inertia() > 0)
         return Point(theta, start, found, sums, jnp.where(sound, loss, jnp.inf))
 

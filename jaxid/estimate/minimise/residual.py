@@ -16,7 +16,7 @@ from ...simulation.runs import each, run, run_with_sensitivities
 from .filtering import filtered_by, known_rows
 
 if TYPE_CHECKING:
-    # Whoever reads derivatives knows that they were kept, and a type checker does not.
+    # Callers know that derivatives were kept; the type checker does not.
     ByParameters: TypeAlias = Any
     ByStart: TypeAlias = Any
 else:
@@ -172,7 +172,7 @@ def through_filter(
 
 
 def absorb_start(found: Sensitivity, free: Float[Array, " recordings"]) -> Sensitivity:
-    """Takes out of the derivatives what initial states can explain as well.
+    """Projects initial states out of the derivatives.
 
     **Arguments:**
 
@@ -183,7 +183,7 @@ def absorb_start(found: Sensitivity, free: Float[Array, " recordings"]) -> Sensi
     count, p = found.jacobian.shape[0], found.jacobian.shape[-1]
     j = found.jacobian.reshape(count, -1, p)
     s = (found.start * free[:, None, None, None]).reshape(count, j.shape[1], -1)
-    # Columns may be alike, or nil where a start is given: only a full decomposition says so.
+    # Columns may be dependent, or zero where a start is given, so a full decomposition is needed.
     basis, size = jax.vmap(column_basis)(s)
     basis = jnp.where((size > 1e-10 * size[:, :1])[:, None, :], basis, 0.0)
     j = j - basis @ jnp.einsum("rka,rkp->rap", basis, j)

@@ -1,4 +1,4 @@
-"""How long a step is taken: damping that follows the quality of the last step."""
+"""Damping that follows the quality of the last step."""
 
 from typing import Any
 
@@ -19,9 +19,9 @@ class SearchState(eqx.Module):
 
 
 class Nielsen(optx.AbstractSearch):
-    """Damping by the ratio of what a step gained to what it promised (Nielsen 1999).
+    """Damping by the ratio of actual to predicted decrease (Nielsen 1999).
 
-    A step is accepted where the squared error falls. After refusals the damping grows ever
+    A step is accepted if the squared error decreases. After each rejection the damping grows
     faster.
 
     **Arguments:**

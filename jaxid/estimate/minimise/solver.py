@@ -13,11 +13,11 @@ from .arrow import Arrow, Unknowns, empty_arrow
 from .descent import BoundedDescent, DescentState, Products, promised
 from .search import Nielsen, SearchState
 
-# Size of a step that is as good as undamped.
+# Step size above which a step counts as undamped.
 FULL = 1e10
 # Accepted steps over which the loss must fall by `worth`.
 STEPS_JUDGED = 5
-# Damping from which on a step is shorter than rounding.
+# Damping above which a step is shorter than rounding.
 LARGEST_DAMPING = 1e12
 
 

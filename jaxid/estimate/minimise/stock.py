@@ -1,4 +1,4 @@
-"""The problem as optimistix' own solvers know it: a function without bounds."""
+"""The problem for optimistix' own solvers: a function without bounds."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from .problem import Problem, point_around, residual_at
 
 
 def check_solver(solver: Any, mesh: Mesh | None) -> None:
-    """Refuses what cannot minimise a squared error.
+    """Refuses objects that cannot minimise a squared error.
 
     **Raises:** `FitError` for another object than a solver of optimistix, and where devices are to
     share the recordings, which only jaxid's own does.

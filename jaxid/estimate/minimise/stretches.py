@@ -1,8 +1,7 @@
 """Long recordings linearised one stretch of time after the other.
 
-What is held is then of one stretch, however long the recording is. A stretch begins with the state
-and the tangents with which the last one ended, and with the rows that its noise filter looks back
-on.
+Memory is needed for one stretch only. A stretch begins with the final state and tangents of the
+previous one, and with the past rows that its noise filter needs.
 """
 
 import dataclasses
@@ -21,7 +20,7 @@ from .residual import Sensitivity, beginning, sensitivity_from
 
 
 class Carried(eqx.Module):
-    """What a stretch hands on to the next.
+    """The state that one stretch passes to the next.
 
     - `x`, `tangents`: the loop's state and its derivatives.
     - `past`: last rows of the residual and its derivatives before the noise filter.
