@@ -61,6 +61,8 @@ class Case:
     recordings: dict[str, dict[str, np.ndarray]]
     # Size of the effect's torque and of the noise, root mean square on its joint.
     strength: tuple[tuple[float, float], ...]
+    # Each effect's torque on its joint along each recording, `(samples,)`.
+    torques: tuple[dict[str, np.ndarray], ...]
 
 
 def draw_wanted(master: int, count: int, laws: Sequence[str], robot: str = "any") -> list[Wanted]:
@@ -128,10 +130,16 @@ def make(wanted: Wanted) -> Case:
         for name, run in zip(NAMES, runs, strict=True)
     }
     wrong = rng.uniform(0.8, 1.25, (len(m), 3))
+    along = [[_along(e, run) for run in runs] for e in hidden]
     strength = tuple(
-        (float(np.sqrt(np.mean(_along(e, runs[0]) ** 2))), float(level[e.joint])) for e in hidden
+        (float(np.sqrt(np.mean(waves[0] ** 2))), float(level[e.joint]))
+        for e, waves in zip(hidden, along, strict=True)
     )
-    return Case(robot, law, hidden, robot.urdf(wrong), recordings, strength)
+    torques = tuple(
+        {name: wave[:: 1000 // rate] for name, wave in zip(NAMES, waves, strict=True)}
+        for waves in along
+    )
+    return Case(robot, law, hidden, robot.urdf(wrong), recordings, strength, torques)
 
 
 def _speed(reference, duration: float) -> np.ndarray:

@@ -30,10 +30,11 @@ WEAK = 1e-6
 
 @dataclass(frozen=True)
 class Entry:
-    """One effect that entered: its key, and the p-value with which it did."""
+    """One effect that entered: its key, the p-value with which it did, and its block's place."""
 
     key: Key
     p_value: float
+    place: int
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,11 @@ def select(
     most: int = 6,
 ) -> list[Entry]:
     """Forward selection by BIC while the F-test's p-value stays below `p_to_enter`."""
-    rows = assemble(loop, recordings)
+    return forward(assemble(loop, recordings), p_to_enter, most)
+
+
+def forward(rows: Rows, p_to_enter: float = 0.01, most: int = 6) -> list[Entry]:
+    """Forward selection among the blocks of rows, whatever they stand for."""
     basis = _basis(rows.base)
     entered: list[Entry] = []
     while len(entered) < most:
@@ -78,7 +83,7 @@ def _enter(rows: Rows, basis: np.ndarray) -> tuple[Entry | None, np.ndarray]:
     rest = rows.right - basis @ (basis.T @ rows.right)
     left = float(rest @ rest)
     best, price, grown = None, count * np.log(left), basis
-    for key, block in zip(rows.keys, rows.blocks, strict=True):
+    for place, (key, block) in enumerate(zip(rows.keys, rows.blocks, strict=True)):
         own = _basis(block, basis)
         if own.shape[1] == 0:
             continue
@@ -90,7 +95,7 @@ def _enter(rows: Rows, basis: np.ndarray) -> tuple[Entry | None, np.ndarray]:
         bic = count * np.log(still) + own.shape[1] * np.log(count)
         if bic < price:
             f = taken / own.shape[1] / (still / spare)
-            best = Entry(key, float(stats.f.sf(f, own.shape[1], spare)))
+            best = Entry(key, float(stats.f.sf(f, own.shape[1], spare)), place)
             price, grown = bic, np.concatenate([basis, own], axis=1)
     return best, grown
 

@@ -7,6 +7,7 @@ by up to a quarter, and knows the law as sampled, takes it for continuous, or do
 
 python -m benchmarks.worlds [--seed N] [--quick] [--count 40] [--law unknown|sampled|continuous|any]
                             [--robot NAME] [--jobs 2] [--out DIR] [--json FILE] [--case N]
+                            [--results FILE]
 """
 
 import argparse
@@ -16,7 +17,9 @@ import tempfile
 import time
 import traceback
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,17 +30,22 @@ from jaxid.storage.campaign import Campaign, Failed
 
 from ._world_cases import KINDS, LAWS, Case, Wanted, draw_wanted, make, read_case, start_model
 from ._world_physics import ROBOTS
+from ._world_results import append, line_of, origin
 from .hidden_effects import configure_jax, floor_percent
 
+# An effect and its joint, from 1; None for those of the whole arm.
+Key = tuple[str, int | None]
 
-def run_case(wanted: Wanted) -> dict[str, Any]:
-    """Makes, solves and judges one case."""
+
+def run_case(wanted: Wanted, seed: int) -> dict[str, Any]:
+    """Makes, solves and judges one case of the bench with this seed."""
     started = time.perf_counter()
     try:
         record = _solve(wanted)
     except Exception:
         record = {"error": traceback.format_exc()}
-    return {**asdict(wanted), **record, "seconds": time.perf_counter() - started}
+    seconds = time.perf_counter() - started
+    return {"run": origin(seed), **asdict(wanted), **record, "seconds": seconds}
 
 
 def _solve(wanted: Wanted) -> dict[str, Any]:
@@ -79,14 +87,27 @@ def judge(case: Case, kind: str, story: dict[str, Any], floor: np.ndarray) -> di
         return {**marks, "right": story["verdict"] == "adequate", "alarm": bool(groups)}
     if kind == "outside":
         return {**marks, "right": not sure, "recognised": story["verdict"] == "outside_catalogue"}
-    marks["first"] = bool(groups) and groups[0][0] in true
-    marks["named"] = [any(t in group for group in groups) for t in true]
-    marks["extra"] = sum(not any(t in group for t in true) for group in groups)
+    marks |= names_right(groups, true)
     marks["wrong_and_sure"] = sum(
         not any(t in group for t in true) and (a["probability"] or 0) > 0.9
         for a, group in zip(story["added"], groups, strict=True)
     )
     return {**marks, "right": all(marks["named"])}
+
+
+def names_right(groups: Sequence[Sequence[Key]], true: Sequence[Key]) -> dict[str, Any]:
+    """Whether the first name is right, which of the true effects are named, and how many names
+    are of nothing that is there.
+
+    **Arguments:**
+
+    - `groups`: what was found, each with what it could not be told from.
+    """
+    return {
+        "first": bool(groups) and groups[0][0] in true,
+        "named": [any(t in group for group in groups) for t in true],
+        "extra": sum(not any(t in group for t in true) for group in groups),
+    }
 
 
 def row(record: dict[str, Any]) -> str:
@@ -168,6 +189,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, help="folder in which a stopped run continues")
     parser.add_argument("--json", type=Path, help="file for all results")
+    parser.add_argument(
+        "--results", type=Path, help="file for a line of each case, as evidence.py reads them"
+    )
     parser.add_argument("--case", type=int, action="append", help="only the case of this number")
     given = parser.parse_args(arguments)
     drawn = 1 if given.quick else secrets.randbits(31)
@@ -181,19 +205,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     configure_jax()
     records = []
     wanted = {case.label: case for case in cases}
-    with Campaign(out, {"seed": seed, "robot": robot}) as campaign:
-        for label, record in campaign.run(run_case, wanted, jobs=given.jobs):
+    lines = nullcontext() if given.results is None else given.results.open("w", encoding="utf-8")
+    with Campaign(out, {"seed": seed, "robot": robot}) as campaign, lines as file:
+        for label, record in campaign.run(partial(run_case, seed=seed), wanted, jobs=given.jobs):
             if isinstance(record, Failed):
-                record = {**asdict(wanted[label]), "error": record.reason}
+                failed = {"run": origin(seed), **asdict(wanted[label])}
+                record = {**failed, "error": record.reason}
             print(row(record), flush=True)
             records.append(record)
+            if file is not None:
+                # Pieces of a folder that was begun before dates were noted have none.
+                append(
+                    file, line_of({"run": {"seed": seed, "date": None, "commit": None}, **record})
+                )
     scores = summary(records)
     for law, lines in scores.items():
         print(f"\nlaw {law}")
         for name, value in lines.items():
             print(f"  {name:48s}{value}")
     if given.json is not None:
-        content = {"seed": seed, "scores": scores, "cases": records}
+        content = {**origin(seed), "scores": scores, "cases": records}
         given.json.write_text(json.dumps(content, indent=1, default=float) + "\n", encoding="utf-8")
 
 

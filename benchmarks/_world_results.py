@@ -1,0 +1,84 @@
+"""Result files of the worlds bench: a line of JSON for each case, with where it comes from."""
+
+import json
+import subprocess
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TextIO
+
+# What of a discovery's story a result file keeps beside the probabilities.
+_KEPT = (
+    "verdict",
+    "reason",
+    "added",
+    "removed",
+    "depends_on",
+    "error_percent",
+    "noise_floor_percent",
+    "took",
+    "cpu",
+)
+
+
+def origin(seed: int) -> dict[str, Any]:
+    """Seed of the bench, date (UTC) and commit of what runs now; the commit ends in `-dirty` where
+    files were changed, and is None outside a checkout."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    try:
+        ran = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
+    except OSError:
+        ran = None
+    commit = ran.stdout.strip() if ran is not None and ran.returncode == 0 else None
+    return {"seed": seed, "date": datetime.now(UTC).date().isoformat(), "commit": commit}
+
+
+def probabilities(models: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The probability of every effect that a model of a story has: the weight of those with it."""
+    total: dict[tuple[str, int | None], float] = {}
+    for model in models:
+        for key in {(e["effect"], e["joint"]) for e in model["effects"]}:
+            total[key] = total.get(key, 0.0) + model["weight"]
+    ranked = sorted(total.items(), key=lambda pair: -pair[1])
+    # What has no weight to speak of would make most of the file.
+    return [
+        {"effect": name, "joint": joint, "probability": min(weight, 1.0)}
+        for (name, joint), weight in ranked
+        if weight > 1e-3
+    ]
+
+
+def line_of(record: dict[str, Any]) -> dict[str, Any]:
+    """A case of jaxid's as a result file has it: marks and answer, without tables of models."""
+    if "story" not in record:
+        return {"tool": "jaxid", **record}
+    story = record["story"]
+    kept = {name: story[name] for name in _KEPT if name in story}
+    kept["probabilities"] = probabilities(story["models"])
+    return {"tool": "jaxid", **record, "story": kept}
+
+
+def append(file: TextIO, line: dict[str, Any]) -> None:
+    """Writes a line at once, so that a run that is stopped leaves the cases that ended."""
+    file.write(json.dumps(line, ensure_ascii=False, default=float) + "\n")
+    file.flush()
+
+
+def read_lines(paths: Iterable[Path]) -> list[dict[str, Any]]:
+    """The lines of result files, of any tools.
+
+    **Raises:** `ValueError` for a line that is none.
+    """
+    found = []
+    for path in paths:
+        for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            try:
+                line = json.loads(text)
+                line["tool"], line["run"]["seed"], line["number"]
+            except (ValueError, KeyError, TypeError) as error:
+                raise ValueError(
+                    f"{path.name}, line {number}: no case of a result file ({error!r}); give files "
+                    "that --results of benchmarks.worlds or benchmarks.baselines wrote"
+                ) from error
+            found.append(line)
+    return found

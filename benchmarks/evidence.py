@@ -1,0 +1,115 @@
+"""Writes what the result files of `benchmarks.worlds` and `benchmarks.baselines` say into a page.
+
+Only what stands between `<!-- made: NAME -->` and `<!-- end: NAME -->` is written anew, NAME being
+worlds, calibration, baselines or power; the rest of the page is left as it is. The figure of the
+power curves (needs the extra `static`) goes to `img/power.png` beside the page.
+
+python -m benchmarks.evidence RESULTS... [--page docs/evidence.md] [--no-figure]
+"""
+
+import argparse
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from ._evidence_power import alone, named, power_figure, power_table
+from ._evidence_tables import WORLDS, Line, by_tool, by_world, calibration
+from ._world_results import read_lines
+
+PAGE = Path(__file__).parents[1] / "docs" / "evidence.md"
+PICTURE = Path("img") / "power.png"
+
+
+def sections(lines: Sequence[Line]) -> dict[str, str]:
+    """The text of every section that there are results for."""
+    ours = [x for x in lines if x["tool"] == "jaxid"]
+    found = {}
+    if ours:
+        tables = [f"By {world}:\n\n{markdown(by_world(ours, world))}" for world in WORLDS]
+        found["worlds"] = "\n\n".join([origins(ours), markdown(by_tool(ours)), *tables])
+        found["calibration"] = f"{origins(ours)}\n\n{markdown(calibration(ours), 'probability')}"
+    shared = same_cases(lines)
+    if any(x["tool"] != "jaxid" for x in shared):
+        found["baselines"] = f"{origins(shared)}\n\n{markdown(by_tool(shared))}"
+    if trials := named(shared):
+        found["power"] = "\n\n".join(
+            [
+                origins(shared),
+                f"![Share of effects named over their size]({PICTURE.as_posix()})",
+                f"Named, by size over the noise:\n\n{markdown(power_table(trials), 'size')}",
+                "All named, and nothing else, by the size of the smallest:\n\n"
+                + markdown(power_table(alone(shared)), "size"),
+            ]
+        )
+    return found
+
+
+def same_cases(lines: Sequence[Line]) -> list[Line]:
+    """The lines of the cases that every tool was given, with the law unknown."""
+    unknown = [x for x in lines if x["law"] == "unknown"]
+    tools = {x["tool"] for x in unknown}
+    asked: dict[int, set[str]] = {}
+    for line in unknown:
+        asked.setdefault(line["seed"], set()).add(line["tool"])
+    return [x for x in unknown if asked[x["seed"]] == tools]
+
+
+def origins(lines: Sequence[Line]) -> str:
+    """How many cases of which seeds, when, and of which commits."""
+    cases = len({(x["seed"], x["law"]) for x in lines})
+    runs = [x["run"] for x in lines]
+    seeds, dates, commits = (
+        ", ".join(sorted({str(r[name] or "not noted") for r in runs}))
+        for name in ("seed", "date", "commit")
+    )
+    return f"{cases} cases; seed {seeds}; date {dates}; commit {commits}."
+
+
+def markdown(table: pd.DataFrame, corner: str = "") -> str:
+    """A table as Markdown has it."""
+    head = [f"| {' | '.join([corner, *map(str, table.columns)])} |"]
+    rule = [f"|{' --- |' * (len(table.columns) + 1)}"]
+    cells = [[str(k), *row] for k, row in zip(table.index, table.to_numpy(), strict=True)]
+    return "\n".join([*head, *rule, *(f"| {' | '.join(row)} |" for row in cells)])
+
+
+def placed(page: str, texts: dict[str, str]) -> str:
+    """The page with sections in place of what stood between their marks.
+
+    **Raises:** `ValueError` where a section has no marks in the page, or two pairs of them.
+    """
+    for name, text in texts.items():
+        begin, end = f"<!-- made: {name} -->", f"<!-- end: {name} -->"
+        pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.DOTALL)
+        if len(pattern.findall(page)) != 1:
+            raise ValueError(
+                f"the page has no place for {name}, or more than one: "
+                f"put one pair of lines {begin} and {end} where it is to stand"
+            )
+        page = pattern.sub(lambda _, made=f"{begin}\n\n{text}\n\n{end}": made, page)
+    return page
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Writes the page; see the module's first lines."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("results", type=Path, nargs="+", help="files that --results wrote")
+    parser.add_argument("--page", type=Path, default=PAGE)
+    parser.add_argument("--no-figure", action="store_true", help="leave the picture as it is")
+    given = parser.parse_args(arguments)
+    lines = read_lines(given.results)
+    made = sections(lines)
+    page = placed(given.page.read_text(encoding="utf-8"), made)
+    if "power" in made and not given.no_figure:
+        picture = given.page.parent / PICTURE
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        figure = power_figure(same_cases(lines))
+        figure.write_image(picture, width=860, height=380, scale=1.5)
+    given.page.write_text(page, encoding="utf-8")
+    print(f"{len(lines)} lines, sections {', '.join(made) or 'none'}, written to {given.page}")
+
+
+if __name__ == "__main__":
+    main()
