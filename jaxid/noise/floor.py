@@ -75,10 +75,12 @@ def _white(power: Float[np.ndarray, "windows bins"], share: float) -> Level | No
     if len(power) < _WINDOWS:
         return None
     lower, upper = (part.mean(axis=1) for part in np.array_split(power, 2, axis=1))
-    if min(lower.mean(), upper.mean()) <= 0:
+    if min(lower.min(), upper.min()) <= 0:
         return None
-    slope = np.log(lower.mean() / upper.mean())
-    chance = np.hypot(_relative(lower), _relative(upper))
+    # By the median over windows, since a step in one of them has a spectrum of its own.
+    ratios = np.log(lower / upper)
+    slope = np.median(ratios)
+    chance = 1.25 * np.median(abs(ratios - slope)) / 0.674 / np.sqrt(0.6 * len(ratios))
     if chance > _UNSURE or (abs(slope) > _COLOURED and abs(slope) > _SURE * chance):
         return None
     mean, spread = share * power.mean(), _relative(power.mean(axis=1))
