@@ -1,8 +1,9 @@
 """Pictures of each effect, and of the residual of a fit without it: docs/img/effects.
 
-PYTHONPATH=. python docs/pictures.py    needs the extra `static`; about a minute
+PYTHONPATH=. python docs/pictures.py [Stribeck ...]    needs the extra `static`; a minute for all
 """
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,25 +12,43 @@ from jaxtyping import Float
 from plotly.subplots import make_subplots
 
 import jaxid
+from jaxid.chain import Chain
 from jaxid.discovery.diagnosis import Verdict, coordinate_unit
 from jaxid.display import figures
-from jaxid.effects import Counterbalance, Curve, SharedShaft
+from jaxid.effects import BaseTilt, CableDrag, CarriedBody, Counterbalance, Curve, SharedShaft
 
 OUT = Path(__file__).parent / "img" / "effects"
 DEMO = Path(jaxid.__file__).parent / "demo" / "clean"
 COORDINATES = ("q", "v", "a", "tau")
+# The arm of the demo as a chain in space: two upright axes, and what its links weigh.
+CHAIN = Chain(
+    np.tile(np.eye(3), (2, 1, 1)),
+    ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)),
+    ((0.0, 0.0, 1.0),) * 2,
+    (0.0, 0.0, -9.81),
+    (False, False),
+    (0.4, 0.0, 0.0),
+)
+LINKS = ((0.0,) * 6 + (1.0, 0.0, 0.0, 4.0), (0.0,) * 6 + (0.3, 0.0, 0.0, 1.5))
 # Effects that are not proposed for an arm in a plane, as one would show them.
-ELSEWHERE = (Counterbalance(joint=2, angle=-1.0), SharedShaft(joint=1, driven=2))
+ELSEWHERE = (
+    Counterbalance(joint=2, angle=-1.0),
+    SharedShaft(joint=1, driven=2),
+    CableDrag(joint=1, following=2),
+    BaseTilt(CHAIN, LINKS),
+    CarriedBody(CHAIN, recordings=("fit_2",)),
+)
 
 
 def main() -> None:
-    """Writes one picture for each class of the catalogue."""
+    """Writes one picture for each class of the catalogue, or for those that are named."""
     recordings = jaxid.read(DEMO / "fit_1.csv", DEMO / "fit_2.csv")
-    catalogue = (*jaxid.catalogue, *ELSEWHERE)
+    wanted = [e for e in jaxid.catalogue if e.__name__ in (sys.argv[1:] or [e.__name__])]
+    catalogue = (*wanted, *(e for e in ELSEWHERE if type(e) in wanted))
     fit = jaxid.fit(jaxid.scara(), recordings)
     diagnosis = jaxid.diagnose(fit, catalogue=catalogue, progress=False)
     OUT.mkdir(parents=True, exist_ok=True)
-    for effect in jaxid.catalogue:
+    for effect in wanted:
         forms = [v for v in diagnosis.forms if type(v.hypothesis.effect) is effect]
         # The lighter joint shows most; some effects are on neither or on both.
         shown = next((v for v in forms if v.hypothesis.joint == 2), forms[0])

@@ -95,6 +95,17 @@ def test_settings_of_the_process_are_each_taken_away(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_body_at_the_tip_of_six_joints_is_found(tmp_path):
+    pytest.importorskip("mujoco")
+    pytest.importorskip("example_robot_data")
+    case = _quick("six_joints", tmp_path)["cases"][0]
+    assert "error" not in case, case["error"]
+    assert case["marks"]["right"], case["marks"]
+    found = case["story"]["added"][0]["parameters"]["mass"]["value"]
+    assert found == pytest.approx(case["numbers"]["mass"], rel=0.03)
+
+
+@pytest.mark.slow
 def test_worlds_are_simulated_by_mujoco_and_judged(tmp_path):
     pytest.importorskip("mujoco")
     lines = tmp_path / "lines.jsonl"

@@ -16,6 +16,7 @@ ROOT = PACKAGE.parent
 FLOORS = (
     {
         "arms",
+        "chain",
         "compiling",
         "control",
         "display",
@@ -38,7 +39,7 @@ FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 
 # Physics knows what a parameter is, and no data.
 NOUNS = ("arms", "effects")
-FOR_NOUNS = {"errors", "linear_algebra", "parameters"}
+FOR_NOUNS = {"chain", "errors", "linear_algebra", "parameters"}
 
 LONGEST = 500
 

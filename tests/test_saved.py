@@ -14,6 +14,7 @@ import pytest
 from test_discover_cli import told
 
 import jaxid
+from jaxid.chain import Chain
 from jaxid.errors import SaveError
 from jaxid.storage import archive, saved
 
@@ -91,7 +92,8 @@ def test_a_loaded_story_writes_the_same_page(tmp_path: Path) -> None:
 
 
 def test_loops_of_every_class_come_back() -> None:
-    scene_free = [e for e in jaxid.catalogue if e.__name__ not in ("Payload",)]
+    own = ("Payload", "BaseTilt", "CarriedBody")
+    scene_free = [e for e in jaxid.catalogue if e.__name__ not in own]
     # A joint has one transmission at the most.
     place = {"Backlash": 2}
     effects = [
@@ -104,6 +106,12 @@ def test_loops_of_every_class_come_back() -> None:
         jaxid.control.OpenLoop(),
     )
     loops = [jaxid.scara(c).add(*effects, jaxid.effects.Payload()) for c in controllers]
+    chain = Chain(
+        np.tile(np.eye(3), (2, 1, 1)), np.ones((2, 3)), np.eye(3)[:2], (0, 0, -9.81), (False,) * 2
+    )
+    carried = jaxid.effects.CarriedBody(chain, 0.5, (0.1, 0.2), ("a",), (6, 7))
+    tilted = jaxid.effects.BaseTilt(chain, np.ones((2, 10)), x=0.1)
+    loops += [loop.add(carried, tilted) for loop in loops[:1]]
     loops += [jaxid.two_link(), jaxid.two_link(link_length=0.3)]
     loops += [jaxid.emps(jaxid.control.Cascade(delay=True)).hold("M").free("eps1")]
     loops += [dataclasses.replace(jaxid.emps(), resolution=(1e-6,))]

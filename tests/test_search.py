@@ -10,7 +10,7 @@ from independent import effects as fx
 from stories import recordings_of, search_of, with_chain
 
 import jaxid
-from jaxid.discovery.explore import _plain, key_of
+from jaxid.discovery.explore import _fitted, _plain, key_of
 from jaxid.discovery.hypotheses import Hypothesis
 from jaxid.discovery.landscape import Entry, shares_a_joint
 from jaxid.discovery.likelihood import price, score, weights
@@ -21,6 +21,7 @@ from jaxid.effects import (
     Backlash,
     JointElasticity,
     QuadraticDrag,
+    RotorInertia,
     Spring,
     Stribeck,
     TorqueOffset,
@@ -96,6 +97,13 @@ def test_effect_is_added_twice_at_the_most():
     name = "torque_ripple", 1
     assert _plain([entry], Counter({name: 1})) == [entry]
     assert _plain([entry], Counter({name: 2})) == []
+
+
+def test_what_is_held_may_be_added_to():
+    """A rotor of a data sheet may be wrong, so another may be found on its joint."""
+    loop = jaxid.scara().add(RotorInertia(joint=2, inertia=0.1))
+    assert any(isinstance(e, RotorInertia) for e in _fitted(loop))
+    assert not any(isinstance(e, RotorInertia) for e in _fitted(loop.hold("Ia2")))
 
 
 def test_a_joint_has_one_transmission():

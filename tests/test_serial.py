@@ -14,6 +14,8 @@ from jaxid.effects import Counterbalance, SharedShaft
 from jaxid.errors import ModelError
 
 pinocchio = pytest.importorskip("pinocchio")
+# Where Pinocchio has `jaxid.arms.BODY`: mass, first moments, then xx, xy, yy, xz, yz, zz.
+PINOCCHIO = (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
@@ -94,7 +96,7 @@ def test_torque_inertia_and_regressor_are_pinocchios(described):
     model, position = pinocchio_of(path, arm)
     data = model.createData()
     rng = np.random.default_rng(0)
-    count = 200
+    count = 1000
     q = rng.uniform(arm.lower, arm.upper, (count, arm.joints))
     v, a = rng.normal(size=(2, count, arm.joints))
 
@@ -112,6 +114,16 @@ def test_torque_inertia_and_regressor_are_pinocchios(described):
     size = np.abs(expected).max()
     np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-12 * size)
     np.testing.assert_allclose(mass, full, rtol=0, atol=1e-12 * np.abs(full).max())
+    # By a link's parameters torque is linear: each base parameter has the column of its leader.
+    places = np.asarray([10 * (k // 10) + PINOCCHIO[k % 10] for k in arm.leading])
+    by_bodies = np.array(
+        [
+            np.array(pinocchio.computeJointTorqueRegressor(model, data, *x))[:, places]
+            for x in zip(at, v, a, strict=True)
+        ]
+    )
+    largest = np.abs(by_bodies).max()
+    np.testing.assert_allclose(regressor, by_bodies, rtol=0, atol=1e-12 * largest)
     # What drawings round to is left out of the combinations.
     np.testing.assert_allclose(regressor @ np.asarray(arm.base), expected, atol=1e-7 * size)
 

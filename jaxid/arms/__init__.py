@@ -1,10 +1,10 @@
 """Rigid bodies: equations of motion in base parameters, one arm a file."""
 
+from ..chain import BODY as BODY
+from ..chain import Chain as Chain
 from ._base import AbstractArm as AbstractArm
 from ._base import Split as Split
 from .axis import Axis as Axis
-from .chain import BODY as BODY
-from .chain import Chain as Chain
 from .physical import PhysicalBodies as PhysicalBodies
 from .physical import physical_bodies as physical_bodies
 from .scara import SCARA as SCARA

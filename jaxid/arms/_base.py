@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..chain import InSpace
 from ..linear_algebra import smallest_eigenvalue
 from ..parameters import list_parameters, read_values, write_values
 
@@ -99,6 +100,13 @@ class AbstractArm(eqx.Module):
     def planar(self) -> bool:
         """Whether links move in one plane, link angles being sums of joint angles."""
         return True
+
+    def in_space(self) -> InSpace | None:
+        """Its joints and bodies in space, None where not known.
+
+        With them a base that is not level and payloads are looked for in space.
+        """
+        return None
 
     def couplings(self) -> tuple[tuple[int, int, float], ...]:
         """Pairs of joints that may share a shaft, and its turns for one turn of the first joint."""

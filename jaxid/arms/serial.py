@@ -1,6 +1,7 @@
 """A serial arm in space with any number of joints, in base parameters."""
 
 import os
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -10,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..chain import BODY, Chain, InSpace, moved_body
 from ..errors import ModelError
 from ..parameters import KNOWN, Vector, as_float64, parameter
 from ._base import AbstractArm
-from .chain import BODY, Chain
 from .urdf import Described, read_urdf
 
 
@@ -94,7 +95,7 @@ class SerialArm(AbstractArm):
             for what in ("rotation", "offset", "axis")
         )
         slides = tuple(joint.slides for joint in found.joints)
-        chain = Chain(rotations, offsets, axes, gravity, slides)
+        chain = Chain(rotations, offsets, axes, gravity, slides, found.tip)
         lower = tuple(joint.lower for joint in found.joints)
         upper = tuple(joint.upper for joint in found.joints)
         matrix = (
@@ -170,6 +171,14 @@ class SerialArm(AbstractArm):
         """False: the links move in space."""
         return False
 
+    def in_space(self) -> InSpace:
+        """Its chain, and the bodies on it."""
+        shift = jax.jacfwd(moved_body)(jnp.zeros(10), self.chain.tip)
+        shown = np.asarray(self.combined)[:, -10:] @ np.asarray(shift)
+        # Mass and first moments, which weigh as well, before moments of inertia.
+        kept = _independent(shown, [9, 6, 7, 8, *range(6)], 1e-6)
+        return InSpace(self.chain, self.inertias(), tuple(kept))
+
     def couplings(self) -> tuple[tuple[int, int, float], ...]:
         """Pairs that `gears` couples; without `gears`, all neighbouring joints that turn."""
         if self.gears is None:
@@ -243,19 +252,8 @@ def _base_parameters(
 
     chain = _chain(geometry, slides)
     rows, _ = _regressor(geometry, slides, lower, upper)
-    size = np.linalg.norm(rows, axis=0)
-    size = np.where(size > 1e-9 * size.max(), size, 0.0)
-    kept: list[int] = []
-    basis = np.zeros((len(rows), 0))
-    for k in sorted(np.flatnonzero(size > 0), key=lambda k: _led(int(k), chain)):
-        column = rows[:, k] / size[k]
-        for _ in range(2):
-            column = column - basis @ (basis.T @ column)
-        left = np.linalg.norm(column)
-        if left > 1e-7:
-            basis = np.column_stack([basis, column / left])
-            kept.append(int(k))
-    kept.sort()
+    order = sorted(range(rows.shape[1]), key=lambda k: _led(k, chain))
+    kept = sorted(_independent(rows, order, 1e-7))
     combined = scipy.linalg.lstsq(rows[:, kept], rows)[0]
     combined[np.abs(combined) < 1e-9] = 0.0
     names = []
@@ -263,6 +261,26 @@ def _base_parameters(
         several = np.count_nonzero(np.abs(row) > 1e-6) > 1
         names.append(f"{BODY[k % 10]}{k // 10 + 1}{'R' if several else ''}")
     return tuple(kept), tuple(names), combined
+
+
+def _independent(
+    rows: Float[np.ndarray, "rows columns"], order: Sequence[int], tolerance: float
+) -> list[int]:
+    """Columns that are no sum of those before them in that order."""
+    size = np.linalg.norm(rows, axis=0)
+    kept: list[int] = []
+    basis = np.zeros((len(rows), 0))
+    for k in order:
+        if size[k] <= 1e-9 * size.max():
+            continue
+        column = rows[:, k] / size[k]
+        for _ in range(2):
+            column = column - basis @ (basis.T @ column)
+        left = np.linalg.norm(column)
+        if left > tolerance:
+            basis = np.column_stack([basis, column / left])
+            kept.append(k)
+    return kept
 
 
 def _led(place: int, chain: Chain) -> tuple[bool, int]:

@@ -37,12 +37,14 @@ class Described(eqx.Module):
     - `bodies`: ten parameters of each joint's link and all that is fixed to it, `(joints, 10)`, in
       the link's frame and the order of `jaxid.arms.BODY`.
     - `carried`: names of the links whose bodies these are.
+    - `tip`: where the last link of the chain has its origin, in the frame of the last joint, m.
     """
 
     name: str = eqx.field(static=True)
     joints: tuple[DescribedJoint, ...]
     bodies: Float[np.ndarray, "joints 10"]
     carried: tuple[str, ...] = eqx.field(static=True, default=())
+    tip: tuple[float, ...] = eqx.field(static=True, default=(0.0, 0.0, 0.0))
 
 
 def parsed_urdf(source: str | os.PathLike[str]) -> Any:
@@ -91,7 +93,9 @@ def read_urdf(
         )
     bodies, carried = _bodies(links, parents, owner, base, len(joints), where)
     _check_masses(bodies, joints, where)
-    return Described(root.get("name") or "robot", tuple(joints), bodies, carried)
+    return Described(
+        root.get("name") or "robot", tuple(joints), bodies, carried, tuple(owner[tip][2].tolist())
+    )
 
 
 # --- the tree -----------------------------------------------------------------------------------

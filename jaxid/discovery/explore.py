@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ..effects import AbstractEffect, Curve
 from ..noise import ARFilter
+from ..simulation.loop import ClosedLoop
 from .landscape import Entry, Landscape, form, shares_a_joint
 from .likelihood import score
 from .predict import Prediction, least_squares
@@ -165,7 +166,8 @@ def _moves(
     at: Candidate,
     most: int,
 ) -> Iterator[tuple[AbstractEffect, ...]]:
-    had = Counter(form(e)[:2] for e in (*landscape.predictor.system.loop.effects, *at.effects))
+    own = _fitted(landscape.predictor.system.loop)
+    had = Counter(form(e)[:2] for e in (*own, *at.effects))
     if len(at.effects) < most:
         entries = _plain(landscape.beside(at.prediction), had)
         best = entries[0].evidence if entries else 0.0
@@ -194,6 +196,12 @@ def _moves(
         for entry in others[:_PAIRED]:
             if entry.evidence > 0:
                 yield (*less, entry.effect)
+
+
+def _fitted(loop: ClosedLoop) -> list[AbstractEffect]:
+    """The loop's own effects of which anything is estimated: what is held may be wrong."""
+    places = {p.place[1] for p in loop.free_parameters if p.place[0] == "effects"}
+    return [e for k, e in enumerate(loop.effects) if k in places]
 
 
 def _plain(entries: Sequence[Entry], had: Counter) -> list[Entry]:

@@ -96,6 +96,8 @@ def survey(
         tuple(loop.arm.first_moments()),
         loop.arm.planar(),
         tuple(loop.arm.couplings()),
+        loop.arm.in_space(),
+        not any(p.place[0] == "arm" for p in loop.free_parameters),
     )
 
 

@@ -9,6 +9,7 @@ from ._base import on_joint as on_joint
 from ._base import recording_label as recording_label
 from ._base import smooth_sign as smooth_sign
 from ._scene import Scene as Scene
+from .cable import CableDrag as CableDrag
 from .counterbalance import Counterbalance as Counterbalance
 from .coupling import SharedShaft as SharedShaft
 from .curve import Curve as Curve
@@ -36,6 +37,8 @@ from .position import Tilt as Tilt
 from .position import TorqueOffset as TorqueOffset
 from .position import TorqueRipple as TorqueRipple
 from .sensor import EncoderEccentricity as EncoderEccentricity
+from .space import BaseTilt as BaseTilt
+from .space import CarriedBody as CarriedBody
 from .transmission import Backlash as Backlash
 from .transmission import JointElasticity as JointElasticity
 
@@ -57,9 +60,12 @@ catalogue: tuple[type[AbstractEffect], ...] = (
     TorqueSaturation,
     Gravity,
     Tilt,
+    BaseTilt,
     Spring,
     Counterbalance,
+    CableDrag,
     Payload,
+    CarriedBody,
     RotorInertia,
     SharedShaft,
     ThermalDrift,

@@ -4,6 +4,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..chain import InSpace
+
 
 class Scene(eqx.Module):
     """Ranges of the recorded motion, one value for each joint, in SI units.
@@ -17,6 +19,8 @@ class Scene(eqx.Module):
     - `slides`: whether a joint slides. `planar`: whether links move in one plane.
     - `couplings`: pairs of joints that may share a shaft, and its turns for one of the first joint.
     - `moments`: first moments of each link in its own frame, kg·m; None where not known.
+    - `space`: joints and bodies of an arm in space; None of others.
+    - `drawn`: whether its bodies are held at what a drawing says.
     """
 
     q_low: Float[np.ndarray, " joints"]
@@ -35,6 +39,8 @@ class Scene(eqx.Module):
     moments: tuple[tuple[float, float] | None, ...]
     planar: bool = True
     couplings: tuple[tuple[int, int, float], ...] = ()
+    space: InSpace | None = None
+    drawn: bool = False
 
     @property
     def joints(self) -> range:

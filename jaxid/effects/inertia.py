@@ -22,8 +22,8 @@ class RotorInertia(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["RotorInertia"]:
-        """Joints from 2 on: that of the first joint is part of its base inertia."""
-        return [cls(joint=j) for j in scene.joints if j > 1]
+        """Joints from 2 on: that of the first is part of its base inertia, unless that is held."""
+        return [cls(joint=j) for j in scene.joints if j > 1 or scene.drawn]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """J a on the joint, `(joints,)`."""

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..parameters import as_float64
+from .parameters import as_float64
 
 # Names of a body's ten parameters (Khalil, Dombre 2002), without the link's number: inertia about
 # the origin of the link's frame, first moment, mass.
@@ -18,6 +18,7 @@ class Chain(eqx.Module):
     - `axes`: unit vectors in the joint's frame, along which it slides or about which it turns.
     - `gravity`: in the base's frame, m/s².
     - `slides`: whether a joint slides.
+    - `tip`: where tools and payloads are fixed, in the last link's frame, m.
     """
 
     rotations: Float[Array, "joints 3 3"] = eqx.field(converter=as_float64)
@@ -25,6 +26,7 @@ class Chain(eqx.Module):
     axes: Float[Array, "joints 3"] = eqx.field(converter=as_float64)
     gravity: Float[Array, "3"] = eqx.field(converter=as_float64)
     slides: tuple[bool, ...] = eqx.field(static=True)
+    tip: Float[Array, "3"] = eqx.field(converter=as_float64, default=(0.0, 0.0, 0.0))
 
     @property
     def joints(self) -> int:
@@ -114,6 +116,33 @@ class Chain(eqx.Module):
         angular = jnp.einsum("kij,kj->ki", inertia, turning) + jnp.cross(moment, passing)
         upper = jnp.triu(turning @ angular.T + passing @ linear.T)
         return upper + jnp.triu(upper, 1).T
+
+
+class InSpace(eqx.Module):
+    """An arm as what loads it in space sees it.
+
+    - `chain`: its joints. `bodies`: `BODY` of each link.
+    - `carried`: places in `BODY` of what a body at the tip shows of its own in any motion, its mass
+      first; all ten of an arm that moves its tip freely.
+    """
+
+    chain: Chain
+    bodies: Float[Array, "joints 10"] = eqx.field(converter=as_float64)
+    carried: tuple[int, ...] = eqx.field(static=True)
+
+
+def moved_body(body: Float[Array, "10"], place: Float[Array, "3"]) -> Float[Array, "10"]:
+    """`BODY` about the origin of a frame, of a body given about a place in it (parallel axes).
+
+    **Arguments:**
+
+    - `body`: about the place, along the frame's axes. `place`: in the frame, m.
+    """
+    moment, mass = body[6:9], body[9]
+    # Linear in the body: its mass need not be above zero.
+    both = jnp.outer(place, moment) + jnp.outer(moment, place) + mass * jnp.outer(place, place)
+    shift = jnp.trace(both) * jnp.eye(3) - both
+    return jnp.concatenate([body[:6] + shift[jnp.triu_indices(3)], moment + mass * place, body[9:]])
 
 
 def _cross_matrix(x: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -1,0 +1,384 @@
+"""Arms of six and seven joints under an unknown law: is the hidden effect named?
+
+Published URDFs (Universal Robots, Unitree Z1, Kinova, Panda without its fingers) are simulated by
+MuJoCo under a law that is computed at 1 kHz from quantised encoders. One effect is hidden, or none.
+The user has the URDF, the rotors' data sheet, two recordings of 10 s to fit and one to judge, and
+does not know the law.
+
+A body at the tip is a part of the last link: on all recordings it shows only where the links are
+held as drawn, and where they are estimated it is hidden in one recording alone. So are a rotor and
+a counterbalance a part of what is estimated, and are hidden from held links. Links that are
+estimated are drawn wrong by up to a fifth.
+
+python -m benchmarks.six_joints [--seed N] [--count 40] [--quick] [--jobs 1] [--out DIR]
+                                [--case N] [--json FILE]
+"""
+
+import argparse
+import json
+import math
+import secrets
+import tempfile
+import time
+import traceback
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxid
+from jaxid.storage.campaign import Campaign, Failed
+
+from ._six_joints_world import (
+    ROBOTS,
+    Plant,
+    Run,
+    arm_alone,
+    bare,
+    inertias,
+    limits,
+    simulate,
+    text,
+    torques,
+    with_payload,
+    with_wrong_bodies,
+)
+from ._world_physics import Friction, Reference
+from .hidden_effects import configure_jax
+
+EFFECTS = (
+    "payload",
+    "base_tilt",
+    "stribeck",
+    "load_dependent_friction",
+    "rotor_inertia",
+    "torque_offset",
+    "torque_ripple",
+    "shared_shaft",
+    "counterbalance",
+)
+# What estimated links would swallow.
+OF_DRAWN = ("rotor_inertia", "counterbalance")
+RATE, DURATION, WRONG = 250, 10.0, 0.2
+NAMES = ("fit_1", "fit_2", "held_out")
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a case is to be; no effect where it is clean."""
+
+    number: int
+    seed: int
+    robot: str
+    effect: str
+    bodies: str
+
+    @property
+    def label(self) -> str:
+        """For file names and tables."""
+        return f"{self.number:03d}_{self.robot}_{self.bodies}_{self.effect or 'clean'}"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A case as it was made: what the user has, and what is true.
+
+    - `joint`: where the effect is, from 1; None for effects of the whole arm.
+    - `size`: of its torque beside that of the noise, root mean square, where it is largest.
+    """
+
+    loop: jaxid.ClosedLoop
+    recordings: tuple[jaxid.Recording, ...]
+    joint: int | None
+    numbers: dict[str, float]
+    size: float
+
+
+def draw_wanted(master: int, count: int) -> list[Wanted]:
+    """`count` cases: one of five clean, the others with one effect."""
+    rng = np.random.default_rng(master)
+    found = []
+    for number in range(count):
+        clean = rng.random() < 0.2
+        effect = "" if clean else str(rng.choice(EFFECTS))
+        bodies = "drawn" if effect in OF_DRAWN else str(rng.choice(["drawn", "free"]))
+        robot = str(rng.choice(list(ROBOTS)))
+        found.append(Wanted(number, int(rng.integers(1, 2**31)), robot, effect, bodies))
+    return found
+
+
+def make(wanted: Wanted) -> Case:
+    """The case, simulated."""
+    rng = np.random.default_rng(wanted.seed)
+    root, tip = arm_alone(wanted.robot)
+    plant = bare(text(root))
+    n = len(plant.rotors)
+    home, references = _motions(rng, plant)
+    plant, scale = _drive(rng, plant, references[0], home)
+    level = rng.uniform(0.003, 0.01, n) * scale
+    plants, joint, numbers = _hide(rng, wanted, plant, references[0], home, level)
+    if wanted.effect == "payload":
+        loaded = text(with_payload(root, tip, numbers["mass"], [numbers[x] for x in "xyz"]))
+        which = [not numbers["once"] or name == "fit_2" for name in NAMES]
+        plants = [replace(plant, urdf=loaded) if w else plant for w in which]
+    bandwidth = 2 * math.pi * rng.uniform(5.0, 9.0, n)
+    step = 2 * math.pi / 2 ** int(rng.integers(17, 20))
+    runs = [
+        simulate(own, reference, home, bandwidth, step, DURATION)
+        for own, reference in zip(plants, references, strict=True)
+    ]
+    drawn = root if wanted.bodies == "drawn" else with_wrong_bodies(root, rng, WRONG)
+    sheet = list(plant.rotors)
+    if wanted.effect == "rotor_inertia" and joint is not None:
+        sheet[joint - 1] *= numbers["told"]
+    loop = _model(text(drawn), tip, sheet, wanted.bodies)
+    recordings = tuple(
+        _recorded(rng, run, level, name) for run, name in zip(runs, NAMES, strict=True)
+    )
+    size = float(np.max([np.sqrt(np.mean(run.taken**2, axis=0)) / level for run in runs]))
+    return Case(loop, recordings, joint, numbers, size)
+
+
+def _model(urdf: str, tip: str, rotors: Sequence[float], bodies: str) -> jaxid.ClosedLoop:
+    """What a user writes who takes the drives to have no offsets, and trusts the data sheet."""
+    loop = jaxid.serial(urdf, rotors=rotors, bodies=bodies, tip=tip)
+    for j in range(1, loop.joints + 1):
+        loop = loop.without("torque_offset", j).hold(f"Ia{j}")
+    return loop
+
+
+def _motions(rng: np.random.Generator, plant: Plant) -> tuple[np.ndarray, list[Reference]]:
+    """A pose inside the limits, and sums of sines about it; less than 1.2 rad either way."""
+    low, high = limits(plant.model())
+    home = (low + high) / 2 + rng.uniform(-0.12, 0.12, len(low)) * (high - low)
+    travel = np.minimum(1.2, 0.35 * (high - low))
+    pace = math.exp(rng.uniform(math.log(0.4), math.log(1.0)))
+    made = []
+    for _ in NAMES:
+        parts = []
+        for span in travel:
+            rates = 2 * math.pi * np.exp(rng.uniform(np.log(0.08), np.log(pace), 5))
+            sizes = rng.uniform(0.4, 1.0, 5) / (1.0 + (rates / (math.pi * pace)) ** 2)
+            sizes *= span / np.sum(sizes)
+            phases = rng.uniform(0, 2 * math.pi, 5)
+            parts.append(tuple(zip(sizes.tolist(), rates.tolist(), phases.tolist(), strict=True)))
+        made.append(Reference("sines", tuple(parts)))
+    return home, made
+
+
+def _drive(
+    rng: np.random.Generator, plant: Plant, reference: Reference, home: np.ndarray
+) -> tuple[Plant, np.ndarray]:
+    """The plant with rotors and friction, and how large its joints' torques are, N·m."""
+    import mujoco
+
+    model = plant.model()
+    data = mujoco.MjData(model)
+    data.qpos[:] = home
+    mujoco.mj_forward(model, data)
+    m = inertias(model, data)
+    rotors = np.maximum(rng.uniform(0.2, 0.8, len(m)) * m, 0.01 * m.max())
+    plant = replace(plant, rotors=tuple(rotors.tolist()))
+    asked = np.sqrt(np.mean(torques(plant, reference, home, DURATION) ** 2, axis=0))
+    scale = np.maximum(asked, 0.02 * asked.max())
+    speed = np.abs(_speeds(reference)).max(axis=0)
+    family = str(rng.choice(["tanh", "root", "arctan", "dry"]))
+    frictions = tuple(
+        Friction(
+            viscous=float(scale[j] / speed[j] * rng.uniform(0.05, 0.2)),
+            coulomb=float(scale[j] * rng.uniform(0.1, 0.3)),
+            family=family,
+            width=float(speed[j] * math.exp(rng.uniform(math.log(0.003), math.log(0.03)))),
+        )
+        for j in range(len(m))
+    )
+    return replace(plant, frictions=frictions), scale
+
+
+def _speeds(reference: Reference) -> np.ndarray:
+    positions = np.array([reference.at(t) for t in np.arange(0.0, DURATION, 0.01)])
+    return np.gradient(positions, 0.01, axis=0)
+
+
+def _hide(
+    rng: np.random.Generator,
+    wanted: Wanted,
+    plant: Plant,
+    reference: Reference,
+    home: np.ndarray,
+    level: np.ndarray,
+) -> tuple[list[Plant], int | None, dict[str, float]]:
+    """The plants of the recordings with the effect, its joint from 1, and its numbers."""
+    n = len(home)
+    j = int(rng.integers(0, n - (wanted.effect == "shared_shaft")))
+    numbers = _numbers(rng, wanted, reference, j)
+    if wanted.effect == "base_tilt":
+        tilt = numbers["roll"], numbers["pitch"]
+        return [replace(plant, tilt=tilt)] * len(NAMES), None, numbers
+    if wanted.effect in ("", "payload"):
+        return [plant] * len(NAMES), None, numbers
+    if wanted.effect == "rotor_inertia":
+        return [plant] * len(NAMES), j + 1, numbers
+    q = home + np.array([reference.at(t) for t in np.arange(0.0, DURATION, 0.01)])
+    through = torques(replace(plant, rotors=(0.0,) * n), reference, home, DURATION)
+    one = replace(plant, extra=((wanted.effect, j, {**numbers, "size": 1.0}),))
+    rows = zip(q.tolist(), _speeds(reference).tolist(), through.tolist(), strict=True)
+    plain = np.sqrt(np.mean(np.array([one.unseen(*row) for row in rows]) ** 2, axis=0))
+    # Five to twenty times the noise before anything makes up for it.
+    times = math.exp(rng.uniform(math.log(5), math.log(20)))
+    numbers["size"] = float(times * level[j] / plain[j])
+    made = replace(plant, extra=((wanted.effect, j, numbers),))
+    return [made] * len(NAMES), j + 1, numbers
+
+
+def _numbers(
+    rng: np.random.Generator, wanted: Wanted, reference: Reference, j: int
+) -> dict[str, float]:
+    """The numbers that give an effect its shape."""
+    uniform, speed = rng.uniform, float(np.abs(_speeds(reference)).max(axis=0)[j])
+    match wanted.effect:
+        case "payload":
+            once = wanted.bodies == "free" or rng.random() < 0.3
+            whole = float(bare(text(arm_alone(wanted.robot)[0])).model().body_mass.sum())
+            places = dict(zip("xyz", uniform(-0.1, 0.1, 3).tolist(), strict=True))
+            return {"mass": whole * uniform(0.03, 0.12), "once": float(once), **places}
+        case "base_tilt":
+            angle, way = math.radians(uniform(1.0, 4.0)), uniform(0, 2 * math.pi)
+            return {"roll": angle * math.cos(way), "pitch": angle * math.sin(way)}
+        case "stribeck":
+            velocity = speed * uniform(0.03, 0.12)
+            return {"velocity": velocity, "exponent": float(rng.choice([1.0, 2.0]))}
+        case "torque_ripple":
+            return {"harmonic": float(rng.integers(6, 25)), "phase": uniform(0, 2 * math.pi)}
+        case "shared_shaft":
+            return {"share": float(rng.choice([-1.0, 1.0])), "viscous": uniform(0.0, 1.0) / speed}
+        case "counterbalance":
+            return {"angle": uniform(-1, 1), "ratio": uniform(0.1, 0.4), "gas": uniform(0, 0.3)}
+        case "rotor_inertia":
+            return {"told": uniform(0.0, 0.5)}
+    return {}
+
+
+def _recorded(rng: np.random.Generator, run: Run, level: np.ndarray, name: str) -> jaxid.Recording:
+    """The run as it was logged, with noise in its torque."""
+    every = round(1000 / RATE)
+    tau = run.tau[::every]
+    noise = level * rng.standard_normal(tau.shape)
+    return jaxid.Recording.from_arrays(run.time[::every], run.q[::every], tau + noise, name=name)
+
+
+def run_case(wanted: Wanted) -> dict[str, Any]:
+    """Makes, solves and judges one case."""
+    started = time.perf_counter()
+    try:
+        record = _solve(wanted)
+    except Exception:
+        record = {"error": traceback.format_exc()}
+    return {**asdict(wanted), **record, "seconds": time.perf_counter() - started}
+
+
+def _solve(wanted: Wanted) -> dict[str, Any]:
+    case = make(wanted)
+    started, cpu = time.perf_counter(), time.process_time()
+    fitting, held_out = case.recordings[:2], case.recordings[2]
+    found = jaxid.discover(
+        case.loop, jaxid.Recordings.of(fitting), validate=held_out, progress=False
+    )
+    took = {"took": time.perf_counter() - started, "cpu": time.process_time() - cpu}
+    story = found.to_dict()
+    return {
+        "joint": case.joint,
+        "numbers": case.numbers,
+        "size": case.size,
+        "story": {**story, **took},
+        "marks": judge(wanted, case.joint, story),
+    }
+
+
+def judge(wanted: Wanted, joint: int | None, story: dict[str, Any]) -> dict[str, Any]:
+    """What was right of a story: the first effect with its joint; nothing, where it is clean.
+
+    Shared is a first place that the weight is shared for, between this effect and another.
+    """
+    added = [(a["effect"], a["joint"]) for a in story["added"]]
+    marks: dict[str, Any] = {"verdict": story["verdict"], "added": added}
+    if not wanted.effect:
+        return {**marks, "right": not added and story["verdict"] == "adequate"}
+    true = wanted.effect, joint
+    marks["right"] = added[:1] == [true]
+    rivals = story["added"][0]["indistinguishable"] if added else []
+    marks["shared"] = true in [(i["effect"], i["joint"]) for i in rivals]
+    marks["extra"] = sum(a != true for a in added)
+    return marks
+
+
+def row(record: dict[str, Any]) -> str:
+    """One line of the table."""
+    head = f"{record['number']:3d} {record['robot']:7s}{record['bodies']:6s}"
+    truth = record["effect"] or "-"
+    if "error" in record:
+        return f"{head}{truth:28s}ERROR {record['error'].strip().splitlines()[-1][:150]}"
+    if record["joint"] is not None:
+        truth += f"({record['joint']})"
+    marks = record["marks"]
+    state = "ok" if marks["right"] else "shared" if marks.get("shared") else "NO"
+    said = " + ".join(e + ("" if j is None else f"({j})") for e, j in marks["added"]) or "-"
+    return f"{head}{truth:28s}{state:7s}{record['story']['cpu']:6.0f} s  {marks['verdict']}: {said}"
+
+
+def summary(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Scores: (right, of)."""
+    done = [r for r in records if "marks" in r]
+    of = {
+        "first effect and joint right": [r for r in done if r["effect"]],
+        "clean ones left alone": [r for r in done if not r["effect"]],
+        **{name: [r for r in done if r["effect"] == name] for name in EFFECTS},
+    }
+    table: dict[str, Any] = {
+        name: (sum(r["marks"]["right"] for r in rows), len(rows)) for name, rows in of.items()
+    }
+    table["CPU seconds, median"] = float(np.median([r["story"]["cpu"] for r in done] or [0]))
+    table["errors"] = [r["number"] for r in records if "error" in r]
+    return table
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs the bench; see the module's first lines."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, help="of everything; drawn anew if not given")
+    parser.add_argument("--quick", action="store_true", help="one arm with a body at its tip")
+    parser.add_argument("--count", type=int, default=40)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="folder in which a stopped run continues")
+    parser.add_argument("--json", type=Path, help="file for all results")
+    parser.add_argument("--case", type=int, action="append", help="only the case of this number")
+    given = parser.parse_args(arguments)
+    drawn = 1 if given.quick else secrets.randbits(31)
+    seed = drawn if given.seed is None else given.seed
+    cases = draw_wanted(seed, given.count)
+    cases = [w for w in cases if given.case is None or w.number in given.case]
+    if given.quick:
+        cases = [Wanted(0, seed, "ur5", "payload", "drawn")]
+    out = given.out or Path(tempfile.mkdtemp(prefix="six_joints_"))
+    print(f"seed {seed}, {len(cases)} cases, results in {out}", flush=True)
+    configure_jax()
+    records = []
+    wanted = {case.label: case for case in cases}
+    with Campaign(out, {"seed": seed}) as campaign:
+        for label, record in campaign.run(run_case, wanted, jobs=given.jobs):
+            if isinstance(record, Failed):
+                record = {**asdict(wanted[label]), "error": record.reason}
+            print(row(record), flush=True)
+            records.append(record)
+    scores = summary(records)
+    for name, value in scores.items():
+        print(f"  {name:48s}{value}")
+    if given.json is not None:
+        content = {"seed": seed, "scores": scores, "cases": records}
+        given.json.write_text(json.dumps(content, indent=1, default=float) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

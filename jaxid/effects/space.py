@@ -1,0 +1,157 @@
+"""What weighs on an arm in space: a base that is not level, and a body that its tip carries."""
+
+import dataclasses
+from collections.abc import Iterable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..chain import BODY, Chain, moved_body
+from ..parameters import KNOWN, Scalar, Vector, as_float64, parameter
+from ._base import NOBODY, AbstractEffect, Motion, recording_label
+from ._scene import Scene
+
+MASS = BODY.index("M")
+
+
+class BaseTilt(AbstractEffect):
+    """A base that is not level: gravity leans to the sides of where it was drawn.
+
+    Its size is known, so that two slopes say all: along g + |g| (x e1 + y e2), with e1 and e2
+    across g. For a base that was drawn upright, e1 is its x axis and e2 its y axis. Each link
+    weighs on the joints before it by its mass and first moment (Khalil, Dombre 2002).
+
+    **Arguments:**
+
+    - `chain`: joints of the arm, with gravity as drawn.
+    - `bodies`: `BODY` of each link, SI units, `(joints, 10)`. They are not estimated: where the
+      arm's base parameters are, the links weigh here what they weighed when the effect was made.
+    - `x`, `y`: tangents of the angles by which gravity leans; None for one that no torque shows.
+    """
+
+    chain: Chain = eqx.field(metadata=KNOWN)
+    bodies: Float[Array, "joints 10"] = eqx.field(converter=as_float64)
+    # Up to the square of the angle torque is linear in them.
+    x: Scalar | None = parameter(0.0, symbol="tiltx", unit="1", scale=0.02)
+    y: Scalar | None = parameter(0.0, symbol="tilty", unit="1", scale=0.02)
+    on_link = True
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["BaseTilt"]:
+        """One, for arms in space that weigh anything, with the slopes that their torque shows."""
+        if scene.space is None or not np.any(scene.space.chain.gravity):
+            return []
+        made = cls(scene.space.chain, scene.space.bodies)
+        rng = np.random.default_rng(0)
+        q = rng.uniform(scene.q_low, scene.q_high, (16, len(scene.q_low)))
+        columns = np.asarray(_slopes(made, jnp.asarray(q)))
+        size = np.linalg.norm(columns, axis=0)
+        largest = int(size.argmax())
+        weight = float(np.linalg.norm(scene.space.chain.gravity) * np.sum(scene.space.bodies[:, 9]))
+        if size[largest] <= 1e-9 * weight:
+            return []
+        if np.linalg.svd(columns, compute_uv=False)[-1] > 1e-6 * size[largest]:
+            return [made]
+        return [dataclasses.replace(made, **{"yx"[largest]: None})]
+
+    def gravity(self) -> Float[Array, "3"]:
+        """As it is, in the base's frame, m/s²."""
+        drawn = self.chain.gravity
+        size = jnp.sqrt(drawn @ drawn)
+        down = drawn / size
+        # Across gravity: the base's x axis, or its z axis where gravity is along x.
+        axis = jnp.where(jnp.abs(down[0]) < 0.9, jnp.eye(3)[0], jnp.eye(3)[2])
+        first = axis - (axis @ down) * down
+        first = first / jnp.sqrt(first @ first)
+        second = jnp.cross(first, down)
+        x, y = (0.0 if slope is None else slope for slope in (self.x, self.y))
+        leaning = down + x * first + y * second
+        return size * leaning / jnp.sqrt(leaning @ leaning)
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """What the links weigh more than on a level base, `(joints,)`."""
+        change = dataclasses.replace(self.chain, gravity=self.gravity() - self.chain.gravity)
+        rest = jnp.zeros_like(motion.v)
+        return change.inverse(self.bodies, motion.q, rest, rest)
+
+
+@eqx.filter_jit
+def _slopes(effect: BaseTilt, q: Float[Array, "poses joints"]) -> Float[Array, "rows two"]:
+    """Torque by both slopes at poses at rest, a row a joint."""
+    rest, none = jnp.zeros_like(q[0]), jnp.zeros(0)
+
+    def torque(slopes: Float[Array, " two"], at: Float[Array, " joints"]):
+        leaning = dataclasses.replace(effect, x=slopes[0], y=slopes[1])
+        here = Motion(jnp.zeros(()), at, rest, rest, rest, none, jnp.asarray(NOBODY))
+        return leaning.torque(here)
+
+    return jax.vmap(jax.jacfwd(torque), (None, 0))(jnp.zeros(2), q).reshape(-1, 2)
+
+
+class CarriedBody(AbstractEffect):
+    """A body at the tip of an arm in space, on all or on named recordings.
+
+    Torque is linear in its ten parameters about the tip (Khalil, Dombre 2002). On all recordings it
+    is a part of the last link, and shows only where that is held.
+
+    **Arguments:**
+
+    - `chain`: joints of the arm, and its tip.
+    - `mass`: kg. `rest`: its other parameters about the tip, along the axes of the last link's
+      frame, kg·m² and kg·m, in the order of `shown`.
+    - `recordings`: names of those that have it; all where none is named.
+    - `shown`: places of `rest` in `BODY`; an arm of few joints does not show all, and the others
+      are nil.
+    """
+
+    chain: Chain = eqx.field(metadata=KNOWN)
+    mass: Scalar = parameter(0.0, symbol="payload", unit="kg", lower=0.0, scale=0.5)
+    rest: Vector = parameter((0.0,) * 9, symbol="payload_rest", unit="SI", scale=0.05)
+    recordings: tuple[str, ...] = eqx.field(static=True, default=())
+    shown: tuple[int, ...] = eqx.field(static=True, default=tuple(range(9)))
+    inertial = True
+    on_link = True
+
+    @classmethod
+    def effect_name(cls) -> str:
+        """A payload, of which it is the form in space."""
+        return "payload"
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["CarriedBody"]:
+        """Each of several recordings in turn; and all at once where the last link is held."""
+        if scene.space is None or MASS not in scene.space.carried:
+            return []
+        named = [(name,) for name in scene.recordings] if len(scene.recordings) > 1 else []
+        whole = [()] if scene.drawn else []
+        shown = tuple(sorted(k for k in scene.space.carried if k != MASS))
+        zeros = (0.0,) * len(shown)
+        chain = scene.space.chain
+        return [cls(chain, 0.0, zeros, names, shown) for names in (*whole, *named)]
+
+    @property
+    def rest_names(self) -> tuple[str, ...]:
+        """What the other parameters are called, and on which recordings."""
+        where = f"({','.join(self.recordings)})" if self.recordings else ""
+        return tuple(f"payload_{BODY[k]}{where}" for k in self.shown)
+
+    def about_tip(self) -> Float[Array, "10"]:
+        """Its `BODY` about the tip, SI units."""
+        return jnp.zeros(10).at[jnp.asarray(self.shown, int)].set(self.rest).at[MASS].set(self.mass)
+
+    def centre(self) -> Float[Array, "3"]:
+        """Where its centre of mass is, in the last link's frame, m."""
+        return self.chain.tip + self.about_tip()[6:9] / self.mass
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """What it takes to carry the body along, `(joints,)`."""
+        last = moved_body(self.about_tip(), self.chain.tip)
+        bodies = jnp.zeros((self.chain.joints, 10)).at[-1].set(last)
+        asked = self.chain.inverse(bodies, motion.q, motion.v, motion.a)
+        if not self.recordings:
+            return asked
+        labels = [recording_label(name) for name in self.recordings]
+        return jnp.where(jnp.any(motion.label == jnp.asarray(labels)), asked, 0.0)
