@@ -82,6 +82,7 @@ if _TYPE_CHECKING:
     from .discovery import discover as discover
     from .discovery import discover_all as discover_all
     from .discovery import next_experiment as next_experiment
+    from .discovery import simulator_terms as simulator_terms
     from .excitation import Excitation as Excitation
     from .excitation import Limits as Limits
     from .excitation import PlanarReach as PlanarReach
@@ -102,6 +103,7 @@ _LATER = {
         "discover",
         "discover_all",
         "next_experiment",
+        "simulator_terms",
     ),
     "excitation": ("Excitation", "Limits", "PlanarReach", "optimal_excitation"),
     "report": ("write_report",),

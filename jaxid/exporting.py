@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from .arms import SerialArm
 from .arms.urdf import parsed_urdf, read_urdf
-from .effects import Coulomb, RotorInertia, Viscous
 from .errors import ModelError
 from .simulation.loop import ClosedLoop
+from .simulation.terms import JointTerms, joint_terms
 
 
 def write_urdf(
@@ -52,13 +52,14 @@ def write_urdf(
         for inertial in links[name].findall("inertial"):
             links[name].remove(inertial)
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
+    drives = joint_terms(loop)
     for k, joint in enumerate(found.joints):
         links[joint.link].append(_inertial(masses[k]))
         element = joints[joint.name]
         for old in element.findall("dynamics"):
             element.remove(old)
-        viscous, coulomb, _ = _drive(loop, k + 1)
-        ElementTree.SubElement(element, "dynamics", damping=_text(viscous), friction=_text(coulomb))
+        damping, friction = _text(drives[k].damping), _text(drives[k].frictionloss)
+        ElementTree.SubElement(element, "dynamics", damping=damping, friction=friction)
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding="unicode")
     Path(path).write_text(f'<?xml version="1.0"?>\n{text}\n', encoding="utf-8")
@@ -72,6 +73,9 @@ def write_mjcf(
     bodies: Float[np.ndarray, "joints 10"] | None = None,
 ) -> Path:
     """Writes a MuJoCo model of the arm: bodies, rotors (armature), viscous and dry friction.
+
+    Under a law of position and velocity with constant gains, joints get position actuators as well;
+    `simulator_terms` says what of the drives that leaves out.
 
     **Arguments:**
 
@@ -89,6 +93,7 @@ def write_mjcf(
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true")
     ElementTree.SubElement(root, "option", gravity=_text(*np.asarray(chain.gravity)))
     parent = ElementTree.SubElement(root, "worldbody")
+    drives = joint_terms(loop)
     for k in range(arm.joints):
         x, y, z, w = Rotation.from_matrix(np.asarray(chain.rotations[k])).as_quat()
         place = _text(*np.asarray(chain.offsets[k]))
@@ -109,7 +114,6 @@ def write_mjcf(
             mass=_text(mass),
             fullinertia=_text(xx, yy, zz, xy, xz, yz),
         )
-        viscous, coulomb, rotor = _drive(loop, k + 1)
         ElementTree.SubElement(
             parent,
             "joint",
@@ -117,10 +121,11 @@ def write_mjcf(
             type="slide" if chain.slides[k] else "hinge",
             axis=_text(*np.asarray(chain.axes[k])),
             range=_text(arm.lower[k], arm.upper[k]),
-            damping=_text(viscous),
-            frictionloss=_text(coulomb),
-            armature=_text(rotor),
+            damping=_text(drives[k].damping),
+            frictionloss=_text(drives[k].frictionloss),
+            armature=_text(drives[k].armature),
         )
+    _actuators(root, drives)
     ElementTree.indent(root)
     Path(path).write_text(ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
     return Path(path)
@@ -135,13 +140,18 @@ def _serial(loop: ClosedLoop) -> SerialArm:
     return loop.arm
 
 
-def _drive(loop: ClosedLoop, joint: int) -> tuple[float, float, float]:
-    """Viscous and Coulomb friction and rotor inertia on a joint, of all effects together."""
-    own = [e for e in loop.effects if getattr(e, "joint", None) == joint]
-    viscous = sum(float(e.coefficient) for e in own if isinstance(e, Viscous))
-    coulomb = sum(float(e.level) for e in own if isinstance(e, Coulomb))
-    rotor = sum(float(e.inertia) for e in own if isinstance(e, RotorInertia))
-    return viscous, coulomb, rotor
+def _actuators(root: ElementTree.Element, drives: tuple[JointTerms, ...]) -> None:
+    """Position actuators of the joints whose gains are known."""
+    if not any(terms.kp for terms in drives):
+        return
+    element = ElementTree.SubElement(root, "actuator")
+    for k, terms in enumerate(drives, start=1):
+        if terms.kp is None or terms.kd is None:
+            continue
+        most = terms.forcerange
+        limit = {} if np.isinf(most) else {"forcerange": _text(-most, most)}
+        said = {"joint": f"joint{k}", "kp": _text(terms.kp), "kv": _text(terms.kd)} | limit
+        ElementTree.SubElement(element, "position", said)
 
 
 def _about_centre(

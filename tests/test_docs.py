@@ -187,3 +187,29 @@ def test_the_cascade_of_the_docs_is_a_pi_law_in_closed_form() -> None:
     np.testing.assert_allclose(law.derivative(reading, reference, jnp.zeros(1)), [error])
     held = law.command(reading, reference, jnp.array([0.01]), jnp.eye(1))
     np.testing.assert_allclose(held, [8.0 * error + 40.0 * 0.01 + 0.5])
+
+
+def test_code_of_the_page_on_servos_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    t = np.arange(0, 1, 0.005)
+    goal = 0.5 * np.sin(4 * t)
+    table = np.column_stack([t, goal, 0.9 * goal, 885 * 0.1 * goal, t < 0.8])
+    for kp in (100, 800):
+        header = "t,q_goal,q,pwm,torque_on"
+        np.savetxt(f"kp{kp}.csv", table, delimiter=",", header=header, comments="")
+    asked: list[Any] = []
+    monkeypatch.setattr(jaxid, "fit", lambda loop, runs: SimpleNamespace(loop=loop))
+    monkeypatch.setattr(jaxid, "discover", lambda *args, **given: asked.append(args))
+    monkeypatch.setattr(jaxid, "simulator_terms", lambda fit: asked.append(fit.loop))
+    text = (DOCS / "servos.md").read_text(encoding="utf-8")
+    own: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(block, own)
+    _, runs = asked[0]
+    assert [r.kp[0, 0] for r in runs] == [100, 800]
+    np.testing.assert_allclose(runs[0].tau[:, 0], 0.1 * 7.4 * goal, rtol=1e-3, atol=1e-12)
+    assert runs[1].on.sum() == 160
+    # Held at the horizontal, an open motor gives nothing, and a powered one its stall torque.
+    run = jaxid.simulate(own["loop"], runs[1])[0]
+    assert np.all(run.delivered[t >= 0.8] == 0)
+    assert np.abs(run.delivered[t < 0.8]).max() > 0.01

@@ -40,10 +40,11 @@ app = typer.Typer(
 )
 
 
-def _show_version(asked: bool) -> None:
+def _show_version(asked: bool) -> bool:
     if asked:
         typer.echo(f"jaxid {metadata.version('jaxid-robotics')}")
         raise typer.Exit
+    return asked
 
 
 @app.callback(help=ABOUT)

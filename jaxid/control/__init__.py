@@ -11,8 +11,10 @@ from .certificate import certify as certify
 from .certificate import holds as holds
 from .certificate import mass_error as mass_error
 from .computed_torque import ComputedTorque as ComputedTorque
+from .impedance import Impedance as Impedance
 from .open_loop import OpenLoop as OpenLoop
 from .pd import PD as PD
 from .pid import PID as PID
 from .sampled import Sampled as Sampled
+from .servo import Servo as Servo
 from .tracking import Tracking as Tracking

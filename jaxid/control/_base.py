@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Iterable
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,20 +23,26 @@ class Reading(eqx.Module):
 class Reference(eqx.Module):
     """The reference of the controller; every vector is `(joints,)`.
 
-    `q`, `v`, `a`: the reference motion. `tau`: known torque added to the output, N·m or N.
+    `q`, `v`, `a`: the reference motion. `tau`: known torque added to the output, N·m or N. `held`:
+    what the drives were told or fed with the last sample, by its name in `Recording` (`kp`, ...).
     """
 
     q: Float[Array, " joints"]
     v: Float[Array, " joints"]
     a: Float[Array, " joints"]
     tau: Float[Array, " joints"]
+    held: dict[str, Float[Array, " joints"]] = eqx.field(default_factory=dict)
 
 
 class Signals(eqx.Module):
-    """Inputs of a controller from a recording, at its sample times, `(samples, joints)`."""
+    """Inputs of a controller from a recording, at its sample times, `(samples, joints)`.
+
+    `hold`: whether they hold until the next sample, however a loop interpolates references.
+    """
 
     q: Float[np.ndarray, "samples joints"]
     tau: Float[np.ndarray, "samples joints"]
+    hold: bool = eqx.field(static=True, default=False)
 
 
 class AbstractController(eqx.Module):
@@ -77,6 +84,14 @@ class AbstractController(eqx.Module):
     ) -> Float[Array, " joints"]:
         """The torque that acts now, `(joints,)`; the command unless the law has a delay."""
         return command
+
+    @property
+    def judged(self) -> Literal["torque", "position"]:
+        """What says how good a model under this law is; torque by default.
+
+        Position, where what is recorded in place of a torque follows from the position alone.
+        """
+        return "torque"
 
     @property
     def pace(self) -> float:

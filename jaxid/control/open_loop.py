@@ -1,5 +1,7 @@
 """The recorded torque as input, without feedback."""
 
+from typing import Literal
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -9,6 +11,11 @@ from ._base import AbstractController, Reading, Reference, Signals
 
 class OpenLoop(AbstractController):
     """The recorded torque drives the arm; position is compared instead of torque."""
+
+    @property
+    def judged(self) -> Literal["torque", "position"]:
+        """Position: the recorded torque is what drives it."""
+        return "position"
 
     def command(
         self,

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..errors import ModelError
-from ._base import AbstractController, Reading, Reference
+from ..recording import Recording
+from ._base import AbstractController, Reading, Reference, Signals
 from .pd import _vector
 
 
@@ -58,6 +59,15 @@ class Sampled(AbstractController):
     def period(self) -> float:
         """Time between two ticks, s."""
         return self.every
+
+    @property
+    def judged(self) -> Literal["torque", "position"]:
+        """As the law that is sampled."""
+        return self.law.judged
+
+    def signals(self, recording: Recording) -> Signals:
+        """What the law that is sampled takes, `(samples, joints)`."""
+        return self.law.signals(recording)
 
     def _past(self) -> int:
         return self.window if self.velocity == "difference" else 0

@@ -10,4 +10,6 @@ from .fleet import Fleet as Fleet
 from .fleet import FleetRobot as FleetRobot
 from .fleet import discover_all as discover_all
 from .screening import diagnose as diagnose
+from .simulator import SimulatorTerms as SimulatorTerms
+from .simulator import simulator_terms as simulator_terms
 from .story import Discovery as Discovery

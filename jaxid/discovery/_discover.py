@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ..control import OpenLoop
 from ..display.progress import working
 from ..effects import AbstractEffect
 from ..effects import catalogue as known
@@ -68,7 +67,7 @@ def discover(
     another call.
     """
     started = time.perf_counter()
-    judged = "position" if isinstance(loop.controller, OpenLoop) else "torque"
+    judged = loop.controller.judged
     if method is not None and method.output not in (None, judged):
         raise FitError(
             f"a discovery compares {judged}, by which {loop.name} is judged, and not "

@@ -46,8 +46,8 @@ class Comparison(AbstractShown):
 
     @property
     def signal(self) -> str:
-        """What is judged: torque, or position where the recorded torque drives the arm."""
-        return "position" if isinstance(self.loop.controller, OpenLoop) else "torque"
+        """What is judged: torque, or position where what is recorded of it says no more."""
+        return self.loop.controller.judged
 
     @property
     def error_percent(self) -> "pd.DataFrame":

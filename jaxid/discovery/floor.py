@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..control import OpenLoop, Tracking
+from ..control import Tracking
 from ..noise import Level, above_motion, from_repeats
 from ..recording import Recordings
 from ..signals.smoothing import signal_cutoff
@@ -44,7 +44,7 @@ def floor_of(loop: ClosedLoop, recordings: Recordings) -> Floor | None:
 
     - `loop`: its controller says what is compared; its model does not enter.
     """
-    if isinstance(loop.controller, OpenLoop):
+    if loop.controller.judged == "position":
         return None
     repeats = from_repeats(recordings, lambda pair, rows: compared(loop, pair, list(rows)))
     band = band_of(loop, recordings)
@@ -71,4 +71,5 @@ def _relative(levels: Sequence[tuple[Level | None, ...]], torque: Sequence[np.nd
                 values = np.array([level.value, level.low, level.high])
                 numbers[:, k, j] = 100 * values * np.sqrt(there) / size
     sources = tuple(tuple("" if x is None else x.source for x in row) for row in levels)
-    return Floor(*numbers, sources)
+    percent, low, high = numbers
+    return Floor(percent, low, high, sources)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from ..compiling import compiled
 from ..effects import AbstractTransmission, Motion
 from ..simulation.batch import Batch, Interval
+from ..simulation.dynamics import link_load, unflatten
 from ..simulation.integration import SIGNALS, initial
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import advance, each, run
@@ -84,7 +85,11 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
             seen[:, 4],
             still,
             intervals.label,
+            intervals.held,
         )
+        own = jax.vmap(lambda x: unflatten(loop)(x).effects)(states)
+        load = jax.vmap(lambda at, own: link_load(loop, at, own))(motion, own)
+        motion = dataclasses.replace(motion, load=load)
         return a, b, c, d, start, motion, seen
 
     return Linearised(*each(whole, batch.intervals, batch.q0, batch.v0), places=places)

@@ -93,9 +93,9 @@ class Placed(eqx.Module):
         """A motion with the effect's joints first."""
 
         def rows(m):
-            return m.q, m.v, m.a, m.tau
+            return jax.tree.leaves((m.q, m.v, m.a, m.tau, m.held, m.load))
 
-        return eqx.tree_at(rows, motion, tuple(x[..., self.order] for x in rows(motion)))
+        return eqx.tree_at(rows, motion, [x[..., self.order] for x in rows(motion)])
 
     def back(self, forces: Any) -> Any:
         """What was found of the joints in that order, `(points, joints, ...)`, in the arm's."""

@@ -23,6 +23,7 @@ from .friction import Coulomb as Coulomb
 from .friction import QuadraticDrag as QuadraticDrag
 from .friction import Stribeck as Stribeck
 from .friction import Viscous as Viscous
+from .friction_gear import GearFriction as GearFriction
 from .friction_varying import Hysteresis as Hysteresis
 from .friction_varying import LoadDependentFriction as LoadDependentFriction
 from .friction_varying import LuGre as LuGre
@@ -30,6 +31,7 @@ from .friction_varying import PositionDependentFriction as PositionDependentFric
 from .friction_varying import ThermalDrift as ThermalDrift
 from .inertia import Payload as Payload
 from .inertia import RotorInertia as RotorInertia
+from .motor import DCMotor as DCMotor
 from .position import EndStop as EndStop
 from .position import Gravity as Gravity
 from .position import Spring as Spring

@@ -39,7 +39,9 @@ class Motion(eqx.Module):
     drives deliver, N·m or N. `a` is zero unless the effect is `inertial` or `needs_acceleration`.
     For a `loaded` effect, `tau` is the torque that reaches the links after all other effects on
     the drives. `state` holds the effect's own states. `label` identifies the recording
-    (`recording_label`).
+    (`recording_label`). `held` are signals of the recording
+    that hold from sample to sample, by their names there (`on`, `supply`). For a `loaded` effect,
+    `load` is the torque that the links take without accelerating; None for others.
     """
 
     t: Float[Array, ""]
@@ -49,6 +51,8 @@ class Motion(eqx.Module):
     tau: Float[Array, " joints"]
     state: Float[Array, " states"]
     label: Int[Array, ""]
+    held: dict[str, Float[Array, " joints"]] = eqx.field(default_factory=dict)
+    load: Float[Array, " joints"] | None = None
 
 
 class AbstractEffect(eqx.Module):
@@ -208,7 +212,8 @@ def _uses_acceleration(
         effect = eqx.combine(jax.tree.unflatten(structure, leaves), rest)
         zeros, now = jnp.zeros(joints), jnp.zeros(())
         state = effect.initial_state()
-        return effect.torque(Motion(now, zeros, zeros, a, zeros, state, jnp.asarray(0)))
+        label = jnp.asarray(0)
+        return effect.torque(Motion(now, zeros, zeros, a, zeros, state, label, {}, zeros))
 
     leaves = [jax.ShapeDtypeStruct(shape, kind) for shape, kind in shapes]
     traced = jax.make_jaxpr(torque)(leaves, jax.ShapeDtypeStruct((joints,), float)).jaxpr

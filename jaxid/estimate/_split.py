@@ -54,7 +54,8 @@ def as_motion(motion: Simulated, recording: Recording) -> Motion:
     label = jnp.full(n, recording_label(recording.name))
     signals = (motion.time, motion.q, motion.v, motion.a, motion.tau)
     t, q, v, a, tau = (jnp.asarray(x) for x in signals)
-    return jax.vmap(Motion)(t, q, v, a, tau, jnp.zeros((n, 0)), label)
+    held = jax.device_put(recording.held_at(np.asarray(motion.time)))
+    return jax.vmap(Motion)(t, q, v, a, tau, jnp.zeros((n, 0)), label, held)
 
 
 def split_torque(loop: ClosedLoop, at: Motion, once: bool) -> Float[Array, "4 samples joints"]:

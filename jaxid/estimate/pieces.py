@@ -67,7 +67,7 @@ def compared_signals(method: OutputErrorSettings, loop: ClosedLoop) -> tuple[str
 
     **Raises:** `FitError` where the recorded torque drives the loop and is to be compared.
     """
-    output = method.output or ("position" if isinstance(loop.controller, OpenLoop) else "torque")
+    output = method.output or loop.controller.judged
     if output != "position" and isinstance(loop.controller, OpenLoop):
         raise FitError(
             "the recorded torque drives this loop, so there is no torque to compare: use "

@@ -157,9 +157,11 @@ def regression(
     """
     n = motion.q.shape[0]
     label = np.full(n, recording_label(recording.name))
-    along = (motion.time, motion.q, motion.v, motion.a, motion.tau, np.zeros((n, 0)), label)
+    still, held = np.zeros((n, 0)), recording.held_at(np.asarray(motion.time))
+    along = (motion.time, motion.q, motion.v, motion.a, motion.tau, still, label, held)
     shapes = jax.eval_shape(jax.vmap(Motion), *along)
-    at = jax.device_put(jax.tree.unflatten(jax.tree.structure(shapes), along))
+    leaves = jax.tree.leaves(along)
+    at = jax.device_put(jax.tree.unflatten(jax.tree.structure(shapes), leaves))
     columns, right = _columns(loop, at)
     return np.asarray(columns), np.asarray(right)
 

@@ -100,6 +100,7 @@ def intervals_of(
         jnp.full(n, NOBODY),
         jnp.stack([q, v, second, third], axis=1),
         jnp.zeros((n, 2, joints)),
+        {},
     )
 
 

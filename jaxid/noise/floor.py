@@ -66,7 +66,7 @@ def above_motion(
     first = np.arange(0, recording.samples - _WINDOW + 1, _WINDOW // 2)
     rows = first[:, None] + np.arange(_WINDOW)
     power = np.abs(np.fft.rfft(high[rows] * taper[:, None], axis=1)) ** 2 / np.sum(taper**2)
-    there = moving[rows].all(axis=1)
+    there = np.all(moving[rows], axis=1)
     return tuple(_white(power[there[:, j]][:, used, j], share) for j in range(recording.joints))
 
 

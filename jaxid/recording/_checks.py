@@ -1,4 +1,4 @@
-"""What a recording must satisfy before anything is computed from it."""
+"""Checks of a recording before anything is computed from it."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64
 
 from ..errors import JaxidWarning, brief
 from ._problem import problem
-from ._units import SIGNALS, Units, factors
+from ._units import HELD, SIGNALS, Units, factors
 
 Gaps = Literal["refuse", "allow"]
 Nan = Literal["refuse", "drop"]
@@ -20,17 +20,17 @@ Lines = Sequence[int]
 
 _FEWEST_SAMPLES = 20
 _LARGEST = 1e30
-# Jitter of times in steps that is looked at, and how much smoother a motion then has to be on even
-# times for them to be the right ones.
+# Smallest jitter of times, in steps, that is examined, and how much smoother the motion must be on
+# even times for a warning.
 _JITTER, _ROUGHER = 0.05, 2.0
 
 
 class Accept(eqx.Module):
-    """What of a recording's faults to put up with.
+    """Which faults of a recording to accept.
 
     - `gaps`: `"allow"` for missing stretches of time.
     - `nan`: `"drop"` to leave out samples at which a signal is empty.
-    - `clock`: `"even"` to put a straight line in place of times that jitter.
+    - `clock`: `"even"` to replace times that jitter by evenly spaced ones.
     """
 
     gaps: Gaps = "refuse"
@@ -50,7 +50,7 @@ class Accept(eqx.Module):
 def numeric(
     source: str, column: str, values: object, lines: Lines = ()
 ) -> Float64[np.ndarray, "..."]:
-    """Numbers as float64, of whatever shape they came in.
+    """Converts numbers of any shape to float64.
 
     **Arguments:**
 
@@ -74,10 +74,10 @@ def numeric(
         if array.dtype.kind in "iuf":
             with np.errstate(over="ignore"):
                 return array.astype(np.float64)
-    except Exception as error:  # array-likes run code of others, which may raise anything
+    except Exception as error:  # array-likes may run foreign code, which may raise anything
         raise problem(
             source,
-            f"{column} is ragged or no array of numbers",
+            f"{column} is ragged or not an array of numbers",
             "give one number for each sample and joint",
         ) from error
     raise _not_numeric(source, column, array, lines)
@@ -112,7 +112,7 @@ def _not_numeric(source: str, column: str, array: np.ndarray, lines: Lines) -> E
 
 
 def is_number(cell: object) -> bool:
-    """Whether a cell reads as one real number."""
+    """Whether a cell can be read as one real number."""
     try:
         float(cell)  # pyright: ignore[reportArgumentType]
     except Exception:  # a cell may be any object
@@ -121,7 +121,7 @@ def is_number(cell: object) -> bool:
 
 
 def place(row: int, lines: Lines) -> str:
-    """Where a row, counted from 0, is in the file, or in the array that has no lines."""
+    """The place of a row, counted from 0: its line in the file, or its index in an array."""
     return f"line {lines[row]}" if lines else f"row {row + 1}"
 
 
@@ -134,7 +134,7 @@ def validate(
     accept: "Accept",
     lines: Lines = (),
 ) -> dict[str, Float64[np.ndarray, "..."]]:
-    """Signals in SI that are safe to compute with.
+    """Checked signals in SI units.
 
     **Arguments:**
 
@@ -142,7 +142,7 @@ def validate(
     - `signals`: values by signal, in the units of the file; 1-d means one joint.
     - `labels`: what the file calls the columns of each signal.
     - `units`, `scale`: unit and factor by signal.
-    - `accept`: what of the file's faults to put up with.
+    - `accept`: which faults of the file to accept.
     - `lines`: of the rows in a text file.
 
     **Returns:** `time` `(samples,)` and the others `(samples, joints)`.
@@ -188,7 +188,7 @@ def validate(
 def _without_blanks(
     source: str, signals: dict[str, Float64[np.ndarray, "..."]], lines: Lines
 ) -> tuple[dict[str, Float64[np.ndarray, "..."]], Lines]:
-    """Signals less the samples at which one of them is empty, which a warning counts."""
+    """Signals without the samples at which one of them is empty; a warning counts these."""
     blank = np.any(
         [~np.isfinite(x.reshape(len(x), -1)).all(axis=1) for x in signals.values()], axis=0
     )
@@ -205,7 +205,7 @@ def _without_blanks(
 
 
 def _even(source: str, time: Float64[np.ndarray, " samples"]) -> Float64[np.ndarray, " samples"]:
-    """The straight line through recorded times, of which there is one for each sample."""
+    """Evenly spaced times, by a straight line through the recorded ones."""
     number = np.arange(len(time))
     slope, first = np.polyfit(number, time, 1)
     if not slope > 0:
@@ -214,9 +214,10 @@ def _even(source: str, time: Float64[np.ndarray, " samples"]) -> Float64[np.ndar
 
 
 def _steady(source: str, signals: Mapping[str, Float64[np.ndarray, "..."]]) -> None:
-    """Warns of times that jitter though the samples do not: a logger's times, not the drive's.
+    """Warns of times that jitter although the samples are evenly spaced.
 
-    Along its true times a motion is smooth. Where it is far smoother on even ones, these are it.
+    A motion is smooth over its true times. If it is much smoother over even times, those are the
+    true ones, and the recorded times are a logger's.
     """
     time, q = signals["time"], signals["q"]
     steps = np.diff(time)
@@ -256,9 +257,13 @@ def _shapes(
         raise problem(source, f"time has shape {time.shape}", "give one column of times")
     shaped = {"time": time}
     for signal in (signal for signal in SIGNALS if signal in signals and signal != "time"):
-        values = signals[signal][:, None] if signals[signal].ndim == 1 else signals[signal]
+        values = signals[signal]
+        if signal in HELD and not np.ndim(values):
+            # One number is that of all samples.
+            values = np.broadcast_to(values, np.shape(shaped["q"])).copy()
+        values = values[:, None] if np.ndim(values) == 1 else values
         name = brief(", ".join(labels.get(signal, (signal,))))
-        if values.ndim != 2 or values.shape[1] == 0:
+        if np.ndim(values) != 2 or np.shape(values)[1] == 0:
             raise problem(
                 source,
                 f"{signal} ({name}) has shape {signals[signal].shape}",
@@ -300,7 +305,7 @@ def _finite(
 def _bounded(
     source: str, signal: str, values: Float64[np.ndarray, "..."], labels: Labels, lines: Lines
 ) -> None:
-    """Squares and products of what is larger leave float64, and no robot is that large."""
+    """Refuses values that are not physical and whose squares overflow float64."""
     table = values.reshape(len(values), -1)
     row, joint = np.unravel_index(np.abs(table).argmax(), table.shape)
     if abs(table[row, joint]) > _LARGEST:
@@ -341,10 +346,10 @@ def _increasing(
 
 
 def missing_after(time: Float64[np.ndarray, " samples"]) -> Bool[np.ndarray, " steps"]:
-    """After which samples there is a gap.
+    """Samples that are followed by a gap.
 
-    Uneven sampling has many long steps and a gap is a rare one: five times the median would take
-    the first for the second, five times the 95th percentile is the same where time is even.
+    A gap is a step of more than five times the 95th percentile of all steps. Five times the median
+    would find gaps in uneven sampling, which has many long steps.
     """
     steps = np.diff(time)
     return steps / 5 > np.quantile(steps, 0.95, method="lower")

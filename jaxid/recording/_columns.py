@@ -1,4 +1,4 @@
-"""Which of a table's columns stand for which signal."""
+"""Assigns the columns of a table to signals."""
 
 import contextlib
 import itertools
@@ -16,13 +16,13 @@ from ._joints import by_joint
 from ._problem import problem
 from ._streams import aligned
 from ._table import Table
-from ._units import SIGNALS
+from ._units import HELD, SIGNALS
 
 
 class Layout(eqx.Module):
     """Column names that a published data set uses, in the form of `read(..., columns=...)`.
 
-    `quantised` says that its positions are whole encoder counts where they look like it.
+    `quantised` says that positions which look like whole encoder counts are such.
     """
 
     required: dict[str, str]
@@ -44,7 +44,7 @@ def known_layouts() -> tuple[Layout, ...]:
     """The published data sets that need no `columns`."""
     emps = Layout(
         required={"time": "t", "q": "qm", "q_ref": "qg", "tau": "gtau*vir"},
-        # The name says newton, the recorded controller output jumps by as many volts.
+        # The column's name says newton, but its values are the controller output in volts.
         optional={"tau_ff": "gtau*pulses_N"},
         quantised=True,
     )
@@ -54,8 +54,8 @@ def known_layouts() -> tuple[Layout, ...]:
 class Picked(eqx.Module):
     """Signals found in a table, in its units, with the names they have there.
 
-    `quantised` says that positions are whole encoder counts where they look like it. `lines` are
-    the rows' lines in a text file.
+    `quantised` says that positions which look like whole encoder counts are such. `lines` are the
+    line numbers of the rows in a text file.
     """
 
     signals: dict[str, Float64[np.ndarray, "..."]]
@@ -91,7 +91,7 @@ def labels_of(source: str, table: Table, told: Description) -> tuple[dict[str, l
     """
     layouts = ((layout, layout.columns(table.columns)) for layout in known_layouts())
     known = next(((layout, names) for layout, names in layouts if names is not None), None)
-    # A mapping or a `time` column says that the file is not meant in the way of a known layout.
+    # A mapping or a `time` column means that the file does not have a known layout.
     if told.columns is not None or "time" in table.columns:
         known = None
     named = by_joint(source, table, told)
@@ -137,8 +137,11 @@ def _resolve(
 
 def _default_names(source: str, table: Table, signal: str) -> list[str]:
     here = {*table.columns, *table.refused}
+    if signal in HELD:
+        # A plain kp or supply is a number about the drive in many files, and no signal.
+        here = {name for name in here if name.startswith(f"{signal}_")}
     stem, numbers = f"{signal}_", _numbers(f"{signal}_", here)
-    # A plain v1 may be a voltage; the others mean in every lab what they mean here.
+    # A plain v1 may be a voltage; the other names are unambiguous.
     if not numbers and signal != "v" and (plain := _numbers(signal, here)):
         stem, numbers = signal, plain
     if signal in here and numbers:
@@ -178,7 +181,9 @@ def _stack(
 ) -> Float64[np.ndarray, "..."]:
     if signal == "time":
         return _factor(source, table, signal, names[0])
-    columns = [_column(source, table, signal, name) for name in names]
+    # A gain that is the same all along is no column of its own.
+    column = _factor if signal in HELD else _column
+    columns = [column(source, table, signal, name) for name in names]
     if len(columns) == 1:
         return columns[0]
     for name, column in zip(names, columns, strict=True):
@@ -220,7 +225,7 @@ def _factor(source: str, table: Table, signal: str, name: str) -> Float64[np.nda
 
 
 def missing(source: str, table: Table, signal: str, name: str, beside: str = "") -> Exception:
-    """The error for a column of a signal that is not there, or not of a kind that can be read."""
+    """The error for a column that is missing or cannot be read."""
     if signal in table.unclear:
         return problem(
             source,
@@ -229,10 +234,10 @@ def missing(source: str, table: Table, signal: str, name: str, beside: str = "")
         )
     if table.defaults and signal not in table.defaults and name == f"{signal}_1":
         what = {"q": "positions", "tau": "torques (effort)"}.get(signal, signal)
-        beside = {of: ", ".join(joints) for of, joints in table.defaults.items()}
+        others = {of: ", ".join(joints) for of, joints in table.defaults.items()}
         return problem(
             source,
-            f"no column has {what} of joints, there are {beside}",
+            f"no column has {what} of joints, there are {others}",
             f"record them, or say which they are: columns={{'{signal}': ...}}, --column "
             f"{signal}=... (jaxid.recording.contents_of lists what there is)",
         )
@@ -243,7 +248,7 @@ def missing(source: str, table: Table, signal: str, name: str, beside: str = "")
             "save plain arrays of numbers, in MATLAB by save(file, '-struct', 's')",
         )
     what = f"column {brief(name)} is missing" + (f" though {brief(beside)} is there" * bool(beside))
-    # A neighbour that is well named is another signal, not this one misspelt.
+    # A similar name that is valid is another signal, not a misspelling of this one.
     well_named = re.compile(rf"({'|'.join(SIGNALS)})(_\d+)?")
     what += near(name, (other for other in table.columns if not well_named.fullmatch(other)))
     if table.refused and not table.columns:

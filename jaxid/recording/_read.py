@@ -1,4 +1,4 @@
-"""From files to recordings."""
+"""Reads recordings from files."""
 
 import contextlib
 import csv
@@ -27,7 +27,7 @@ from ._recording import Recordings, build
 from ._table import Table, from_frame, unique
 from ._units import Units
 
-# Two million samples of seven columns as text; a laptop holds what reading them takes.
+# Two million samples of seven columns as text; a laptop has the memory to read them.
 LARGEST = 256 * 2**20
 
 
@@ -65,22 +65,23 @@ def read(
     - `paths`: one for each recording, which takes its name: `.csv`, `.tsv`, `.txt` (or these
       `.gz`), `.parquet`, `.mat`, `.npz`, `.h5`, `.hdf5`, a bag (its folder, `.mcap` or `.db3`); or
       the folder of a LeRobot dataset for all of its episodes, `FOLDER/episode_3` for one.
-    - `columns`: our names to the file's, e.g. `{"time": "t", "q": ["pos1", "pos2"]}`; a name may
+    - `columns`: maps signals to the file's names, e.g. `{"time": "t", "q": ["pos1", "pos2"]}`; a
       be a product, `"gain*current"`, and `time` the period, as a number or the name of one. Where
-      silent: `time`, `q_1..n`, `tau_1..n` and, if there, `q_ref_1..n`, `v_1..n`, `tau_ff_1..n`;
-      also `q`, `tau`, ... for all joints at once. Files of the EMPS benchmark are recognised, and
-      joint states of bags and datasets. Other columns are ignored.
+      silent: `time`, `q_1..n`, `tau_1..n` and, if there, `q_ref_1..n`, `v_1..n`, `tau_ff_1..n`,
+      `v_ref_1..n`, `kp_1..n`, `kd_1..n`, `supply_1..n`, `on_1..n`, of which the last five may be
+      numbers in place of names; also `q`, `tau`, ... for all joints at once. Files of the EMPS
+      benchmark are recognised, and joint states of bags and datasets. Other columns are ignored.
     - `joints`: names of joints in the order of the robot, where a bag or dataset has them; all of
       them by name where silent.
     - `units`: unit by signal, e.g. `{"q": "deg", "v": "deg/s", "tau": "N·mm", "time": "ms"}`; SI
-      where silent, `q_ref` as `q`, `tau_ff` as `tau`.
+      where silent, `q_ref` as `q`, `tau_ff` as `tau`, `v_ref` as `v`.
     - `scale`: factor by signal, one or one for each joint, e.g. `{"tau": [0.062 * 100, 0.05 * 50]}`
       for amperes, by torque constant and gear ratio, or `{"q": 2 * np.pi / 4096}` for counts;
       `q_ref` as `q`, `tau_ff` as `tau`.
     - `resolution`: encoder step, one or one for each joint, rad or m.
     - `gaps`: `"allow"` to accept missing stretches of time.
     - `nan`: `"drop"` to leave out samples at which a signal is empty; a warning counts them.
-    - `clock`: `"even"` to take samples for evenly spaced, where a logger's times jitter.
+    - `clock`: `"even"` to treat samples as evenly spaced where a logger's times jitter.
     - `largest`: size in bytes, unpacked, above which a file is refused; text takes about ten times
       that much memory while it is read.
 
@@ -154,7 +155,7 @@ def _said(source: str, path: Path) -> Iterator[None]:
         yield
     except (JaxidError, GeneratorExit):
         raise
-    except Exception as error:  # parsers of broken files raise nearly anything
+    except Exception as error:  # parsers of broken files may raise any exception
         kind = "".join(path.suffixes[-1 - (path.suffix.lower() == ".gz") :]) or "a folder of logs"
         raise problem(
             source,
@@ -206,9 +207,9 @@ def _bytes(source: str, path: Path, largest: int) -> bytes:
 def _there(source: str, path: Path) -> int:
     """Size of a plain file that can be opened, in bytes."""
     try:
-        # A pipe or a device would be read for ever.
+        # A pipe or a device may never end.
         if path.exists() and not path.is_file() and not path.is_dir():
-            raise problem(source, "is no plain file", "copy its content to a file")
+            raise problem(source, "is not a plain file", "copy its content to a file")
         with open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
     except FileNotFoundError as error:
@@ -329,12 +330,12 @@ def _parquet(source: str, data: bytes, largest: int) -> Table:
     parquet = require("pyarrow.parquet", "parquet")
     file = parquet.ParquetFile(io.BytesIO(data), page_checksum_verification=True)
     groups = [file.metadata.row_group(k) for k in range(file.metadata.num_row_groups)]
-    # A page of one value can stand for any number of rows.
+    # A page with one value can encode any number of rows.
     cells = sum(group.num_rows for group in groups) * file.metadata.num_columns
     size = max(sum(group.total_byte_size for group in groups), 8 * cells)
     if size > largest:
         raise _too_large(source, size, largest)
-    # The metadata of pandas could make a column an index and so hide it.
+    # pandas metadata could turn a column into an index.
     return from_frame(source, file.read().to_pandas(ignore_metadata=True))
 
 
@@ -359,10 +360,10 @@ def _mat(source: str, data: bytes, largest: int) -> Table:
 
 
 def _version_4(data: bytes) -> list[tuple[str, np.ndarray | str]]:
-    """Variables of a MATLAB file of version 4, which knows no compression."""
+    """Variables of a MATLAB file of version 4, which has no compression."""
     import scipy
 
-    # Anything else SciPy would take for version 5, and read with less care than `variables`.
+    # SciPy would read any other file as version 5, with fewer checks than `variables`.
     if 0 not in data[:4]:
         raise ValueError("it is of neither version 4 nor version 5")
     listed = scipy.io.whosmat(io.BytesIO(data))

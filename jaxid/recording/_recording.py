@@ -17,7 +17,7 @@ from ._problem import problem
 from ._steps import quantum
 from ._table import from_frame
 from ._tables import frame_of
-from ._units import SIGNALS, Units
+from ._units import HELD, SIGNALS, Units
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,11 +32,16 @@ class Recording(eqx.Module):
 
     - `time`: `(samples,)`, s.
     - `q`: measured position, `(samples, joints)`, rad or m.
-    - `tau`: the drive's commanded torque as recorded, `(samples, joints)`, N·m or N.
+    - `tau`: the drive's commanded torque as recorded, `(samples, joints)`, N·m or N; V where a
+      motor is driven by voltage (`jaxid.effects.DCMotor`).
     - `q_ref`: reference, `(samples, joints)`, rad or m, or None.
     - `v`: measured velocity, `(samples, joints)`, rad/s or m/s, or None.
     - `tau_ff`: known torque added to the controller's output, which `tau` contains,
       `(samples, joints)`, N·m or N, or None.
+    - `v_ref`, `kp`, `kd`: velocity reference, rad/s or m/s, and gains that the drives were told
+      with every sample, in the unit that the law takes, `(samples, joints)`, or None.
+    - `supply`: measured voltage that feeds the drives, `(samples, joints)`, V, or None.
+    - `on`: 1 where a drive is powered, 0 where its motor is open, `(samples, joints)`, or None.
     - `resolution`: encoder step, `(joints,)`, rad or m, or None.
     - `name`: how tables and figures call it.
     """
@@ -47,6 +52,11 @@ class Recording(eqx.Module):
     q_ref: Float64[np.ndarray, "samples joints"] | None = None
     v: Float64[np.ndarray, "samples joints"] | None = None
     tau_ff: Float64[np.ndarray, "samples joints"] | None = None
+    v_ref: Float64[np.ndarray, "samples joints"] | None = None
+    kp: Float64[np.ndarray, "samples joints"] | None = None
+    kd: Float64[np.ndarray, "samples joints"] | None = None
+    supply: Float64[np.ndarray, "samples joints"] | None = None
+    on: Float64[np.ndarray, "samples joints"] | None = None
     resolution: Float64[np.ndarray, " joints"] | None = None
     name: str = eqx.field(static=True, default="recording")
 
@@ -60,6 +70,11 @@ class Recording(eqx.Module):
         q_ref: object = None,
         v: object = None,
         tau_ff: object = None,
+        v_ref: object = None,
+        kp: object = None,
+        kd: object = None,
+        supply: object = None,
+        on: object = None,
         resolution: Resolution | None = None,
         name: str = "recording",
         units: Units | None = None,
@@ -75,6 +90,7 @@ class Recording(eqx.Module):
         - `time`: `(samples,)`, s.
         - `q`, `tau`, `q_ref`, `v`, `tau_ff`: `(samples, joints)`, or `(samples,)` for one joint;
           rad or m, N·m or N.
+        - `v_ref`, `kp`, `kd`, `supply`, `on`: as the fields; a lone number holds for all samples.
         - `resolution`: encoder step, one or one for each joint, rad or m.
         - `name`: how tables and figures call it.
         - `units`, `scale`: unit and factor by signal where it is not SI, as in `jaxid.read`.
@@ -83,6 +99,7 @@ class Recording(eqx.Module):
         **Raises:** `RecordingError` for whatever makes them unusable.
         """
         given = {"time": time, "q": q, "tau": tau, "q_ref": q_ref, "v": v, "tau_ff": tau_ff}
+        given |= {"v_ref": v_ref, "kp": kp, "kd": kd, "supply": supply, "on": on}
         signals = {
             signal: numeric(name, signal, values)
             for signal, values in given.items()
@@ -161,6 +178,24 @@ class Recording(eqx.Module):
         """Samples in a second, Hz."""
         return 1 / self.period
 
+    @property
+    def held_names(self) -> tuple[str, ...]:
+        """Names of the signals that hold from sample to sample."""
+        return tuple(name for name in HELD if getattr(self, name) is not None)
+
+    def held_at(
+        self, time: Float64[np.ndarray, " times"]
+    ) -> dict[str, Float64[np.ndarray, "times joints"]]:
+        """Signals that hold from sample to sample, by name, at any times, `(times, joints)`.
+
+        **Arguments:**
+
+        - `time`: s.
+        """
+        row = np.searchsorted(self.time, time, side="right") - 1
+        row = np.clip(row, 0, self.samples - 1)
+        return {name: getattr(self, name)[row] for name in self.held_names}
+
     def slice(self, start_s: float | int | None, stop_s: float | int | None) -> "Recording":
         """The samples with `start_s <= time < stop_s`, their times unchanged.
 
@@ -209,7 +244,7 @@ class Recording(eqx.Module):
 
 
 class Recordings(eqx.Module):
-    """Several recordings of the same robot, each under a name of its own; made by `of`."""
+    """Several recordings of the same robot with distinct names; made by `of`."""
 
     recordings: tuple[Recording, ...]
 
@@ -245,16 +280,16 @@ class Recordings(eqx.Module):
 
     @property
     def joints(self) -> int:
-        """How many joints each recording has."""
+        """Number of joints of each recording."""
         return self.recordings[0].joints
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the recordings are called, each differently."""
+        """Names of the recordings, all distinct."""
         return tuple(recording.name for recording in self.recordings)
 
     def common_period(self) -> float:
-        """The sample period, s, of what is to share one noise filter.
+        """The common sample period, s, which noise filters require.
 
         **Raises:** `RecordingError` where periods differ by more than a hundredth.
         """
@@ -264,7 +299,7 @@ class Recordings(eqx.Module):
                 raise problem(
                     other.name,
                     f"it has {other.rate:.4g} samples a second where {first.name} has "
-                    f"{first.rate:.4g}, and a noise filter is of one rate",
+                    f"{first.rate:.4g}, and a noise filter holds for one rate",
                     "resample one of them, or use them apart",
                 )
         return first.period
@@ -303,7 +338,7 @@ class Recordings(eqx.Module):
 
 
 def build(source: str, name: str, picked: Picked, told: Description) -> Recording:
-    """A recording of signals that were found, once they pass all checks.
+    """A recording from signals, after all checks.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""The units a file may come in, and what they are in SI."""
+"""Units of files, and their factors to SI."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -20,9 +20,12 @@ _POSITION = {
     "mm": 1e-3,
 }
 _VELOCITY = {f"{unit}/s": factor for unit, factor in _POSITION.items()} | {"rpm": math.pi / 30}
-_TORQUE = {"Nm": 1.0, "mNm": 1e-3, "Nmm": 1e-3, "kNm": 1e3, "N": 1.0, "kN": 1e3}
+_VOLTAGE = {"V": 1.0, "mV": 1e-3}
+# A drive that is commanded by voltage has one where others have a torque.
+_TORQUE = {"Nm": 1.0, "mNm": 1e-3, "Nmm": 1e-3, "kNm": 1e3, "N": 1.0, "kN": 1e3} | _VOLTAGE
+_GAIN = {"1": 1.0}
 
-# Every signal a recording can hold, with the units it may come in. The order is that of columns.
+# Every signal of a recording with its possible units, in the order of columns.
 SIGNALS: Mapping[str, Mapping[str, float]] = {
     "time": _TIME,
     "q": _POSITION,
@@ -30,10 +33,17 @@ SIGNALS: Mapping[str, Mapping[str, float]] = {
     "tau": _TORQUE,
     "v": _VELOCITY,
     "tau_ff": _TORQUE,
+    "v_ref": _VELOCITY,
+    "kp": _GAIN,
+    "kd": _GAIN,
+    "supply": _VOLTAGE,
+    "on": {"1": 1.0},
 }
+# Those that a drive is told or is fed at a sample, and that hold until the next.
+HELD = ("v_ref", "kp", "kd", "supply", "on")
 
-# What is measured with the same instrument comes in the same unit unless said otherwise.
-_SAME_UNIT_AS = {"q_ref": "q", "tau_ff": "tau"}
+# Signals of the same instrument have the same unit by default.
+_SAME_UNIT_AS = {"q_ref": "q", "tau_ff": "tau", "v_ref": "v"}
 
 Units = Mapping[str, str | Sequence[str]]
 
@@ -41,7 +51,7 @@ Units = Mapping[str, str | Sequence[str]]
 def factors(
     source: str, units: Units | None, scale: Mapping[str, float | int | Sequence[float]] | None
 ) -> dict[str, Float64[np.ndarray, " factors"]]:
-    """What to multiply each signal with to get SI.
+    """Factors from the units of a file to SI.
 
     **Arguments:**
 
@@ -118,6 +128,6 @@ def _factor(
 
 
 def _plain(unit: str) -> str:
-    # N·m is typed in many ways, and micro has two code points.
+    # N·m is written in many ways, and micro has two code points.
     dotless = unit.translate(str.maketrans("", "", "·⋅.* "))
     return dotless.replace("µ", "u").replace("μ", "u").replace("°", "deg").replace("rev", "turn")

@@ -1,4 +1,4 @@
-"""What recordings are like before any model: rates, gaps, ranges, quantisation, rests, repeats."""
+"""Properties of recordings without a model: rates, gaps, ranges, resolution, rests, repeats."""
 
 import html
 import itertools
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 # Share of its highest speed below which a joint rests.
 _REST = 0.01
-# Share of it that a joint reaches in both directions where it turns.
+# Share of it that a joint must reach in both directions to count as reversing.
 _TURN = 0.1
 # Correlation from which two references of one size are one.
 _SAME = 0.9999
 
 
 class Inspection(eqx.Module):
-    """What `inspect` found.
+    """Result of `inspect`.
 
     - `signals`: one row for each recording: samples, rate in Hz, duration in s, jitter of times,
       largest time between two and number of gaps, whether it has a reference and velocities, the
@@ -35,7 +35,7 @@ class Inspection(eqx.Module):
       one), and what is seen of a sampled law: `"every 4"` where torque is held for so many samples,
       `"each"` where it follows the readings sample by sample, `"-"` for nothing.
     - `repeats`: pairs of recordings whose references are the same.
-    - `notes`: what to mend, or to know.
+    - `notes`: problems to correct, and hints.
     """
 
     signals: "pd.DataFrame"
@@ -67,7 +67,7 @@ class Inspection(eqx.Module):
 
 
 def inspect(recordings: Recording | Recordings | Iterable[Recording]) -> Inspection:
-    """Describes recordings: what a user should see before a model is held against them.
+    """Describes recordings before they are compared with a model.
 
     **Arguments:**
 
@@ -195,8 +195,8 @@ def _notes(recordings: Recordings, joints: "pd.DataFrame") -> list[str]:
         rows = joints.xs(j, level="joint")
         if max(rows["turns"].tolist()) < 2:
             notes.append(
-                f"joint {j} hardly reverses in any recording, so friction and offset cannot be "
-                "told apart: record motions to and fro"
+                f"joint {j} rarely reverses in any recording, so friction and offset cannot be "
+                "separated: record motions to and fro"
             )
         if min(rows["rest %"].tolist()) > 80:
             notes.append(

@@ -52,7 +52,7 @@ def evened(recording: Recording) -> Recording:
     names = ("q", "tau", "q_ref", "v", "tau_ff")
     signals = {n: x for n in names if (x := getattr(recording, n)) is not None}
     made = {n: resampled(recording.time, x, time) for n, x in signals.items()}
-    return dataclasses.replace(recording, time=time, **made)
+    return dataclasses.replace(recording, time=time, **made, **recording.held_at(time))
 
 
 def resampled(

@@ -20,7 +20,8 @@ from .loop import ClosedLoop
 class Interval(eqx.Module):
     """What drives the loop from one grid point to the next; the last interval has no length.
 
-    `reference` holds the coefficients of the interval's cubic, `torque` those of a line; `noise`
+    `reference` holds the coefficients of the interval's cubic, `torque` those of a line, `held`
+    signals of the recording that do not change in it, by name, `(joints,)` each; `noise`
     and `rate` are added to the position and velocity that the sensors read, `push` and `pull` to
     the torque on drives and links, each given at both ends and joined by a line, or None.
     """
@@ -31,6 +32,7 @@ class Interval(eqx.Module):
     label: Int[Array, ""]
     reference: Float[Array, "4 joints"]
     torque: Float[Array, "2 joints"]
+    held: dict[str, Float[Array, " joints"]]
     noise: Float[Array, "2 joints"] | None = None
     rate: Float[Array, "2 joints"] | None = None
     push: Float[Array, "2 joints"] | None = None
@@ -119,11 +121,14 @@ def _drive(
     points: tuple[np.ndarray, np.ndarray],
     length: int,
     noise: np.ndarray | None,
-) -> tuple[np.ndarray | None, ...]:
+    held: tuple[str, ...],
+) -> tuple[Any, ...]:
     """The fields of the intervals of one recording, each with `length` points."""
     grid, ticks = points
     signals = loop.controller.signals(recording)
-    kind = loop.stepping.interpolation
+    kind, torque_kind = loop.stepping.interpolation, "linear"
+    if signals.hold:
+        kind = torque_kind = "hold"
     pad = length - len(grid)
 
     def padded(values: np.ndarray) -> np.ndarray:
@@ -140,10 +145,42 @@ def _drive(
         np.append(ticks, np.zeros(pad, bool)),
         np.full(length, recording_label(recording.name)),
         padded(_pieces(recording.time, signals.q, grid, kind, 3)),
-        padded(_pieces(recording.time, signals.tau, grid, "linear", 1)),
+        padded(_pieces(recording.time, signals.tau, grid, torque_kind, 1)),
+        {name: padded(x) for name, x in held_at(recording, grid, held).items()},
         ends,
         rate,
     )
+
+
+def held_names(recordings: Recordings | Sequence[Recording]) -> tuple[str, ...]:
+    """Names of the signals that hold from sample to sample, of all recordings together.
+
+    **Raises:** `RecordingError` where one lacks a signal that another has. Drives of recordings
+    that do not say so are powered.
+    """
+    names = tuple(dict.fromkeys(n for r in recordings for n in r.held_names))
+    for r in recordings:
+        absent = [n for n in names if n not in r.held_names and n != "on"]
+        if absent:
+            raise RecordingError(
+                f"{r.name} has no {absent[0]}, which other recordings have: name its column, or "
+                f"give a number for all of it, Recording.from_arrays(..., {absent[0]}=...)"
+            )
+    return names
+
+
+def held_at(
+    recording: Recording, time: Float[np.ndarray, " times"], names: tuple[str, ...]
+) -> dict[str, Float[np.ndarray, "times joints"]]:
+    """Signals that hold from sample to sample at any times, with drives powered if nothing is said.
+
+    **Arguments:**
+
+    - `names`: as `held_names` gives them.
+    """
+    found = recording.held_at(time)
+    powered = np.ones((len(time), recording.joints))
+    return {name: found.get(name, powered) for name in names}
 
 
 def start_of(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
@@ -229,8 +266,10 @@ def prepare(
     length = max(len(grid) for grid, _ in grids)
     samples = max(r.samples for r in recordings)
     noises = [None] * len(recordings) if noise is None else list(noise)
+    held = held_names(recordings)
     rows = [
-        _drive(loop, r, g, length, e) for r, g, e in zip(recordings, grids, noises, strict=True)
+        _drive(loop, r, g, length, e, held)
+        for r, g, e in zip(recordings, grids, noises, strict=True)
     ]
     fields = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
     # The structure is that of one interval; the values are where they belong already.

@@ -41,7 +41,8 @@ def settle(
     seen = read(loop, state.q, state.v)
     mass = loop.arm.mass_matrix(state.q)
     tau = loop.controller.command(seen, reference, state.controller, mass)
-    motion = Motion(t, state.q, state.v, jnp.zeros_like(state.q), tau, jnp.zeros(0), label)
+    still, none = jnp.zeros_like(state.q), jnp.zeros(0)
+    motion = Motion(t, state.q, state.v, still, tau, none, label, reference.held)
     settled = []
     for effect in loop.effects:
         own = effect.settled(motion)
@@ -172,11 +173,29 @@ def effect_loads(
             link = link + torque
             continue
         drive = drive + torque
-    left = dataclasses.replace(motion, tau=motion.tau - drive + push)
-    for effect, state in own:
-        if effect.loaded:
+    loaded = [(effect, state) for effect, state in own if effect.loaded]
+    if loaded:
+        load = link_load(loop, behind, states)
+        left = dataclasses.replace(motion, tau=motion.tau - drive + push, load=load)
+        for effect, state in loaded:
             drive = drive + effect.torque(dataclasses.replace(left, state=state))
     return drive, link
+
+
+def link_load(
+    loop: ClosedLoop, links: Motion, states: tuple[Float[Array, " _"], ...]
+) -> Float[Array, " joints"]:
+    """Torque that the links take at their position and velocity without accelerating, `(joints,)`.
+
+    **Arguments:**
+
+    - `links`: their motion. `states`: the effects' own.
+    """
+    load, still = loop.arm.bias(links.q, links.v), jnp.zeros_like(links.q)
+    for effect, state in zip(loop.effects, states, strict=True):
+        if effect.on_link and not effect.needs_acceleration:
+            load = load + effect.torque(dataclasses.replace(links, a=still, state=state))
+    return load
 
 
 def inverse(
@@ -229,11 +248,12 @@ def instant(
     command = loop.controller.command(seen, reference, state.controller, mass)
     if loop.controller.imposes:
         a, none = solve_positive(mass, command), jnp.zeros(0)
-        motion = Motion(t, state.q, state.v, a, jnp.zeros_like(a), none, label)
+        motion = Motion(t, state.q, state.v, a, jnp.zeros_like(a), none, label, reference.held)
         rigid = command + loop.arm.bias(state.q, state.v)
         command = rigid + _beside_bodies(loop, motion, state, rigid, outside)
     tau = loop.controller.acting(command, state.controller)
-    motion = Motion(t, state.q, state.v, jnp.zeros_like(state.q), tau, jnp.zeros(0), label)
+    still, none = jnp.zeros_like(state.q), jnp.zeros(0)
+    motion = Motion(t, state.q, state.v, still, tau, none, label, reference.held)
     # An effect's own states see what arrives at it, so that lags in a row compose.
     arriving = []
     for effect, own in zip(loop.effects, state.effects, strict=True):
@@ -283,7 +303,7 @@ def _along_reference(
     at = seen.q - noise.q, seen.v - noise.v
     rates = seen.v - noise.v, reference.a - outside.noise_rate
     (q, v), (_, a) = jax.jvp(lambda q, v: behind(loop, q, v), at, rates)
-    motion = Motion(t, q, v, a, jnp.zeros_like(q), jnp.zeros(0), label)
+    motion = Motion(t, q, v, a, jnp.zeros_like(q), jnp.zeros(0), label, reference.held)
     rigid = loop.arm.inverse(q, v, a)
     tau = rigid + _beside_bodies(loop, motion, state, rigid, outside)
     command = _commanded(loop, motion, tau) + reference.tau

@@ -63,7 +63,7 @@ def _reference(interval: Interval, dt: Float[Array, ""]) -> Reference:
     q = c0 + dt * (c1 + dt * (c2 + dt * c3))
     v = c1 + dt * (2 * c2 + 3 * dt * c3)
     a = 2 * c2 + 6 * dt * c3
-    return Reference(q, v, a, interval.torque[0] + dt * interval.torque[1])
+    return Reference(q, v, a, interval.torque[0] + dt * interval.torque[1], interval.held)
 
 
 def instant_at(loop: ClosedLoop, interval: Interval, t: Float[Array, ""], state: State) -> Instant:

@@ -16,7 +16,7 @@ from ..control import Reading, Reference
 from ..effects import NOBODY
 from ..errors import JaxidWarning, ModelError
 from ..recording import Recordings
-from .batch import check_joints
+from .batch import check_joints, held_at, held_names
 from .dynamics import Outside, instant, rest, unflatten
 from .integration import given
 from .loop import ClosedLoop
@@ -165,36 +165,44 @@ def fastest_rate(loop: ClosedLoop, recordings: Recordings) -> float:
 
 def _rates(loop: ClosedLoop, recordings: Recordings) -> tuple[float, float]:
     """Largest eigenvalues at standstill, and as fast as recordings get over ten samples, 1/s."""
-    still = np.concatenate([r.q[:: max(1, r.samples // 8)] for r in recordings])
-    q, v = [], []
+    few = [np.arange(0, r.samples, max(1, r.samples // 8)) for r in recordings]
+    still = np.concatenate([r.q[rows] for r, rows in zip(recordings, few, strict=True)])
+    names, q, v = held_names(recordings), [], []
+    told = [held_at(r, r.time[rows], names) for r, rows in zip(recordings, few, strict=True)]
     for r in recordings:
         span = min(10, r.samples - 1)
         speed = (r.q[span:] - r.q[:-span]) / (r.time[span:] - r.time[:-span])[:, None]
         fastest = np.abs(speed).argmax(axis=0)
         q.append(r.q[fastest])
         v.append(speed[fastest])
+        told.append(held_at(r, r.time[fastest], names))
     speed = np.concatenate([np.zeros_like(still), *v])
-    slopes = np.asarray(_slopes(loop, *jax.device_put((np.concatenate([still, *q]), speed))))
+    held = {name: np.concatenate([row[name] for row in told]) for name in names}
+    at = jax.device_put((np.concatenate([still, *q]), speed, held))
+    slopes = np.asarray(_slopes(loop, *at))
     return _largest(slopes[: len(still)]), _largest(slopes[len(still) :])
 
 
 @compiled
 def _slopes(
-    loop: ClosedLoop, q: Float[Array, "points joints"], v: Float[Array, "points joints"]
+    loop: ClosedLoop,
+    q: Float[Array, "points joints"],
+    v: Float[Array, "points joints"],
+    held: dict[str, Float[Array, "points joints"]],
 ) -> Float[Array, "points n n"]:
     zeros = jnp.zeros(loop.joints)
 
-    def rate(x, at, speed):
-        reference = Reference(at, speed, zeros, zeros)
+    def rate(x, at, speed, held):
+        reference = Reference(at, speed, zeros, zeros, held)
         state = unflatten(loop)(x)
         outside = Outside(zeros, zeros, Reading(zeros, zeros), zeros)
         now = instant(loop, jnp.zeros(()), state, reference, outside, jnp.asarray(NOBODY))
         return ravel_pytree(now.derivative)[0]
 
-    def slope(at, speed):
-        return jax.jacfwd(rate)(ravel_pytree(rest(loop, at, speed))[0], at, speed)
+    def slope(at, speed, held):
+        return jax.jacfwd(rate)(ravel_pytree(rest(loop, at, speed))[0], at, speed, held)
 
-    return jax.vmap(slope)(q, v)
+    return jax.vmap(slope)(q, v, held)
 
 
 def _largest(slopes: Float[np.ndarray, "points n n"]) -> float:

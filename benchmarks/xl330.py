@@ -1,0 +1,151 @@
+"""A hobby servo with a pendulum (XL330, measured): models of its friction, and what is missing.
+
+Mean absolute position error over twelve recordings, simulated over all of each from its first
+sample, of the five models of friction of the recordings' README: fitted by least squares, and from
+there by Nelder and Mead's method on that error itself, as the README's figures are. Then `discover`
+from M1 on the recordings at kp 100 and 800, judged on those at kp 400. Then the models said in a
+simulator's terms.
+
+python -m benchmarks.xl330 [--quick] [--json FILE]
+"""
+
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import scipy
+
+import jaxid
+from jaxid.effects import GearFriction
+
+from ._output import options, records, show, write
+from ._xl330 import error_mrad, models, recordings
+
+# Of the README, own fits at the nominal voltage.
+README = {"M1": 59.5, "M2": 58.4, "M3": 45.8, "M4": 35.7, "M5": 34.6}
+# Which model each is fitted from.
+FROM = {"M2": "M1", "M3": "M1", "M4": "M3", "M5": "M4"}
+# The sign of velocity, rad/s: a fit of stuck arms needs some width, a figure as little as may be.
+SHARP, EVALUATIONS = 0.003, 200
+METHOD = jaxid.OEM(start="given", initial="rest", max_steps=40, progress=False)
+
+
+def started(loop: jaxid.ClosedLoop, before: jaxid.ClosedLoop | None) -> jaxid.ClosedLoop:
+    """A loop with the values of another for the parameters that both have."""
+    if before is None:
+        return loop
+    known = dict(zip(before.names, map(float, before.theta), strict=True))
+    both = {name: value for name, value in known.items() if name in loop.names}
+    # What M5 tells apart is alike in M4.
+    twins = {"Ke1": "Km1", "Kes1": "Kms1"}
+    both |= {new: known[old] for new, old in twins.items() if new in loop.names and old in known}
+    return loop.with_values(**both)
+
+
+def polished(
+    loop: jaxid.ClosedLoop, given: dict[str, jaxid.Recording], evaluations: int
+) -> jaxid.ClosedLoop:
+    """The loop at the values of least mean absolute error near its own."""
+    low, high = (
+        np.array([getattr(p.declaration, side) for p in loop.free_parameters])
+        for side in ("lower", "upper")
+    )
+    at = np.asarray(loop.theta)
+    scale = np.array([p.declaration.scale for p in loop.free_parameters])
+    size = np.maximum(np.abs(at), 0.1 * scale)
+
+    def error(x: np.ndarray) -> float:
+        theta = jnp.asarray(np.clip(at + size * x, low, high))
+        found = np.mean(list(error_mrad(loop.with_theta(theta), given).values()))
+        return float(found) if np.isfinite(found) else np.inf
+
+    simplex = np.concatenate([np.zeros((1, len(at))), 0.1 * np.eye(len(at))])
+    done = scipy.optimize.minimize(
+        error,
+        np.zeros(len(at)),
+        method="Nelder-Mead",
+        options={"maxfev": evaluations, "initial_simplex": simplex, "adaptive": True},
+    )
+    return loop.with_theta(jnp.asarray(np.clip(at + size * done.x, low, high)))
+
+
+def fits(
+    given: dict[str, jaxid.Recording], names: list[str], evaluations: int
+) -> tuple[pd.DataFrame, dict[str, jaxid.ClosedLoop]]:
+    """A row for each model: its error, mrad, by either way of fitting; and the loops."""
+    rows: dict[str, dict[str, float]] = {}
+    squares: dict[str, jaxid.ClosedLoop] = {}
+    best: dict[str, jaxid.ClosedLoop] = {}
+    for name, loop in models(SHARP).items():
+        if name not in names:
+            continue
+        began = time.perf_counter()
+        loop = started(loop, squares.get(FROM.get(name, "")))
+        fit = jaxid.fit(loop, list(given.values()), METHOD)
+        squares[name] = fit.loop
+        row = {"README": README[name], "least squares": mean(error_mrad(fit.loop, given))}
+        best[name] = polished(fit.loop, given, evaluations)
+        each = error_mrad(best[name], given)
+        row["mean absolute"] = mean(each)
+        for kp in ("kp100", "kp400", "kp800"):
+            row[kp] = mean({n: x for n, x in each.items() if n.startswith(kp)})
+        row["free fall"] = mean({n: x for n, x in each.items() if "lift_and_drop" in n})
+        rows[name] = row | {"seconds": time.perf_counter() - began}
+        print(name, best[name], flush=True)
+    return pd.DataFrame(rows).T.rename_axis("model"), best
+
+
+def mean(errors: dict[str, float]) -> float:
+    """Of the recordings, mrad."""
+    return float(np.mean(list(errors.values())))
+
+
+def discovery(given: dict[str, jaxid.Recording]) -> pd.DataFrame:
+    """A row for each step of a discovery from M1: position error of kp 400, not seen, mrad."""
+    seen = [r for name, r in given.items() if "kp400" not in name]
+    unseen = {name: r for name, r in given.items() if "kp400" in name}
+    story = jaxid.discover(
+        models(SHARP)["M1"],
+        seen,
+        list(unseen.values()),
+        catalogue=(*jaxid.catalogue, GearFriction),
+        method=jaxid.OEM(initial="rest", progress=False),
+        progress=False,
+    )
+    print(story, "\n")
+    rows = {}
+    for step in story.steps:
+        errors = error_mrad(step.fit.loop, unseen)
+        rows[step.label] = {"kp 400, mrad": mean(errors), **errors, "verdict": story.verdict}
+    return pd.DataFrame(rows).T.rename_axis("step")
+
+
+def in_terms(loop: jaxid.ClosedLoop, given: dict[str, jaxid.Recording]) -> pd.DataFrame:
+    """A row for each choice of a simulator's user: the position error that it leaves, mrad."""
+    said = jaxid.simulator_terms(loop, list(given.values()), method=METHOD)
+    print(said, "\n")
+    rows = {choice: mean(error_mrad(one, given)) for choice, one in said.loops.items()}
+    return pd.DataFrame({"mean absolute": rows}).rename_axis("choice")
+
+
+def main() -> None:
+    """Prints the tables."""
+    given = options(__doc__)
+    measured = recordings()
+    names = ["M1", "M3"] if given.quick else list(README)
+    table, loops = fits(measured, names, 30 if given.quick else EVALUATIONS)
+    show(table, ".1f")
+    found = records(table, about="models")
+    if not given.quick:
+        steps = discovery(measured)
+        show(steps, ".1f")
+        found += records(steps, about="discovery")
+        choices = in_terms(loops["M4"], measured)
+        show(choices, ".1f")
+        found += records(choices, about="terms")
+    write(found, given.json)
+
+
+if __name__ == "__main__":
+    main()

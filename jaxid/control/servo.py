@@ -1,0 +1,63 @@
+"""A position servo that drives its motor by duty cycle, as hobby servos and smart actuators do."""
+
+import dataclasses
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..parameters import Vector, parameter
+from ..recording import Recording
+from ._base import AbstractController, Reading, Reference, Signals
+from .pd import _vector
+
+
+class Servo(AbstractController):
+    """volts = supply · clip(gain kp e - damping v, ±duty), with e = q_ref - q beyond the deadband.
+
+    The recorded `tau` is in volts, and `jaxid.effects.DCMotor` makes a torque of them. Since they
+    follow from the position, fits compare positions. `kp` is the recording's, where it has one, and
+    1 where not; so is `supply`. Where the recording says that the drive is off (`on`), it gives no
+    voltage. Goals hold from sample to sample. `Sampled(Servo(...), every=...)` is a servo that
+    computes its law at ticks.
+
+    **Arguments:**
+
+    - `supply`: voltage at full duty, `(joints,)`, V.
+    - `gain`: duty cycle by error, `(joints,)`, 1/rad (1/m), of one unit of the recording's `kp`.
+    - `damping`: duty cycle by measured velocity, `(joints,)`, s/rad (s/m).
+    - `deadband`: errors up to this are taken for none, `(joints,)`, rad (m).
+    - `duty`: largest duty cycle, `(joints,)`.
+    """
+
+    supply: Float[Array, " joints"] = eqx.field(converter=_vector)
+    gain: Vector = parameter(symbol="gain", unit="1/rad", lower=0.0, free=False, linear=False)
+    damping: Float[Array, " joints"] = eqx.field(converter=_vector, default=0.0)
+    deadband: Float[Array, " joints"] = eqx.field(converter=_vector, default=0.0)
+    duty: Float[Array, " joints"] = eqx.field(converter=_vector, default=1.0)
+
+    @property
+    def judged(self) -> Literal["torque", "position"]:
+        """Position: the voltage is a gain times its error."""
+        return "position"
+
+    def signals(self, recording: Recording) -> Signals:
+        """Goals and known voltage, `(samples, joints)`, V."""
+        return dataclasses.replace(super().signals(recording), hold=True)
+
+    def command(
+        self,
+        reading: Reading,
+        reference: Reference,
+        state: Float[Array, " states"],
+        mass: Float[Array, "joints joints"],
+    ) -> Float[Array, " joints"]:
+        """The voltage, `(joints,)`, V."""
+        held = reference.held
+        error = reference.q - reading.q
+        error = error - jnp.clip(error, -self.deadband, self.deadband)
+        duty = self.gain * held.get("kp", 1.0) * error - self.damping * reading.v
+        supply = held.get("supply", self.supply)
+        volts = supply * jnp.clip(duty, -self.duty, self.duty) + reference.tau
+        return held.get("on", 1.0) * jnp.clip(volts, -supply, supply)

@@ -1,0 +1,72 @@
+"""Friction in a gear that is loaded from both of its sides."""
+
+from collections.abc import Iterable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..parameters import Scalar, parameter
+from ._base import AbstractEffect, Motion, on_joint, smooth_sign
+from ._scene import Scene
+from .friction import smoothing_speed
+
+
+class GearFriction(AbstractEffect):
+    """Friction by load: (|Km tau + Ke load| + S (Fs + |Kms tau + Kes load|)) sigma(v).
+
+    With S = exp(-|v/vs|^power), tau the torque that other friction leaves of the drive's, and load
+    what the links take without accelerating, gravity for instance (Duclusaud, Passault, Padois, Ly
+    2025, whose tau_e is -load). Unlike `LoadDependentFriction` it is there in a gear that is
+    driven back by its load while the drive gives nothing.
+
+    **Fields:**
+
+    - `drive`, `back`: Km and Ke; `back` None for one ratio of both.
+    - `slow`, `slow_back`, `level`: Kms, Kes (None for Kms) and Fs.
+    - `velocity`, `power`: of S; `velocity` None for friction without S, whose fields are not used.
+    """
+
+    joint_fields = ("joint",)
+    loaded = True
+    joint: int = eqx.field(static=True)
+    drive: Scalar = parameter(0.0, symbol="Km", unit="1", lower=0.0, upper=0.9, scale=0.1)
+    back: Scalar | None = parameter(None, symbol="Ke", unit="1", lower=0.0, upper=0.9, scale=0.1)
+    slow: Scalar | None = parameter(None, symbol="Kms", unit="1", lower=0.0, upper=0.9, scale=0.1)
+    slow_back: Scalar | None = parameter(
+        None, symbol="Kes", unit="1", lower=0.0, upper=0.9, scale=0.1
+    )
+    level: Scalar | None = parameter(None, symbol="Fs", unit="N·m", lower=0.0, scale=0.1)
+    velocity: Scalar | None = parameter(
+        None, symbol="vs", unit="rad/s", lower=1e-4, scale=0.1, linear=False
+    )
+    power: Scalar = parameter(
+        2.0, symbol="power", unit="1", lower=0.1, upper=4.0, scale=1.0, free=False, linear=False
+    )
+    smoothing: Scalar = smoothing_speed()
+    form: Scalar = parameter(
+        0.0, symbol="form", unit="1", lower=0.0, upper=1.0, scale=1.0, free=False, linear=False
+    )
+
+    @classmethod
+    def screened(cls, scene: Scene) -> Iterable["GearFriction"]:
+        """Every joint, with one ratio of both sides and no peak."""
+        return [cls(joint=j, smoothing=scene.smoothed(j)) for j in scene.joints]
+
+    def torque(self, motion: Motion) -> Float[Array, " joints"]:
+        """The friction on the joint, `(joints,)`."""
+        j = self.joint - 1
+        assert motion.load is not None
+        tau, load, v = motion.tau[j], motion.load[j], motion.v[j]
+
+        def of(drive: Scalar, back: Scalar | None) -> Float[Array, ""]:
+            return jnp.abs(drive * tau + (drive if back is None else back) * load)
+
+        level = of(self.drive, self.back)
+        if self.velocity is not None:
+            # Away from zero, where a power below one has no slope.
+            speed = jnp.sqrt(v**2 + 1e-12) / self.velocity
+            peak = 0.0 if self.level is None else self.level
+            peak = peak if self.slow is None else peak + of(self.slow, self.slow_back)
+            level = level + jnp.exp(-(speed**self.power)) * peak
+        return on_joint(self.joint, level * smooth_sign(v, self.smoothing, self.form), motion)

@@ -1,0 +1,46 @@
+"""A motor that is driven by voltage."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..parameters import Scalar, parameter
+from ._base import AbstractEffect, Motion
+
+
+class DCMotor(AbstractEffect):
+    """Torque kt i of a commanded voltage u, with the current i = (u - kt v) / R, at most `limit`.
+
+    The joint's command, and the torque that its recordings have, is then a voltage. All is seen at
+    the joint: a motor of torque constant k behind a gear of ratio n has kt = n k. Where the
+    recording says that the drive is off (`on`), no current flows and nothing brakes.
+
+    Of recordings whose voltage never is off, R and viscous friction explain the same, but for where
+    the current is at its limit.
+    """
+
+    joint_fields = ("joint",)
+    joint: int = eqx.field(static=True)
+    constant: Scalar = parameter(symbol="kt", unit="N·m/A", lower=1e-6, scale=0.1, linear=False)
+    resistance: Scalar = parameter(symbol="R", unit="ohm", lower=1e-6, scale=1.0, linear=False)
+    limit: Scalar = parameter(
+        jnp.inf, symbol="imax", unit="A", lower=0.0, scale=1.0, free=False, linear=False
+    )
+
+    @classmethod
+    def effect_name(cls) -> str:
+        """Its name in tables."""
+        return "dc_motor"
+
+    @classmethod
+    def spoken(cls) -> str:
+        """Its name in a sentence."""
+        return "DC motor"
+
+    def command(self, motion: Motion) -> Float[Array, " joints"]:
+        """The motor's torque on its joint, N·m or N, and the others' commands, `(joints,)`."""
+        j = self.joint - 1
+        current = (motion.tau[j] - self.constant * motion.v[j]) / self.resistance
+        current = jnp.clip(current, -self.limit, self.limit)
+        powered = motion.held["on"][j] if "on" in motion.held else 1.0
+        return motion.tau.at[j].set(powered * self.constant * current)

@@ -1,0 +1,168 @@
+"""What a drive is in the terms of a physics simulator: MuJoCo's, and of those that follow it."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..control import PD, PID, AbstractController, Impedance, Reading, Reference, Sampled, Servo
+from ..effects import (
+    NOBODY,
+    AbstractEffect,
+    AbstractTransmission,
+    Coulomb,
+    DCMotor,
+    DriveGain,
+    GearFriction,
+    LoadDependentFriction,
+    Motion,
+    RotorInertia,
+    Stribeck,
+    TimeDelay,
+    TorqueSaturation,
+    Viscous,
+)
+from .loop import ClosedLoop
+
+SAID = (Viscous, Coulomb, RotorInertia, DCMotor, DriveGain, TimeDelay, TorqueSaturation)
+LAWS = (PD, PID, Servo, Impedance)
+# An error at which every drive that has a limit is at it, rad or m.
+_FAR = 1e6
+
+
+class JointTerms(eqx.Module):
+    """One joint's drive as a simulator takes it, in SI units on the joint's side of the gear.
+
+    The actuator's torque is kp (q_ref - q) - kd v within ±`forcerange`, late by `delay`; the joint
+    has `armature`, `damping`, which holds the braking of a motor by its back-EMF, and
+    `frictionloss`. `kp` and `kd` are None for a law that is none of these.
+    """
+
+    armature: float
+    damping: float
+    frictionloss: float
+    kp: float | None
+    kd: float | None
+    forcerange: float
+    delay: float
+
+
+def joint_terms(
+    loop: ClosedLoop, told: dict[str, Float[np.ndarray, " joints"]] | None = None
+) -> tuple[JointTerms, ...]:
+    """The drives of a loop in a simulator's terms, as far as these go; one for each joint.
+
+    **Arguments:**
+
+    - `told`: what a recording says of its drives (`kp`, `kd`, `supply`), by name, `(joints,)`.
+    """
+    law, late = loop.controller, np.zeros(loop.joints)
+    limit = np.full(loop.joints, np.inf)
+    if isinstance(law, Sampled):
+        late = late + law.delay * law.every
+        limit = np.broadcast_to(np.asarray(law.limit), limit.shape)
+        law = law.law
+    gains = _gains(loop, law, limit, told or {}) if isinstance(law, LAWS) else None
+    braking = -np.diagonal(_delivered_slopes(loop))
+    found = []
+    for j in range(loop.joints):
+        own = [e for e in loop.effects if getattr(e, "joint", None) == j + 1]
+        delay = sum(float(e.delay) for e in own if isinstance(e, TimeDelay))
+        found.append(
+            JointTerms(
+                armature=sum(float(e.inertia) for e in own if isinstance(e, RotorInertia)),
+                damping=sum(float(e.coefficient) for e in own if isinstance(e, Viscous))
+                + float(braking[j]),
+                frictionloss=sum(float(e.level) for e in own if isinstance(e, Coulomb)),
+                kp=None if gains is None else float(gains[0][j]),
+                kd=None if gains is None else float(gains[1][j]),
+                forcerange=math.inf if gains is None else float(gains[2][j]),
+                delay=delay + float(late[j]),
+            )
+        )
+    return tuple(found)
+
+
+def unsaid(loop: ClosedLoop) -> dict[int, str]:
+    """What of a loop these terms do not express: by the effect's place in it, and -1 for the rest.
+
+    Each with the reason, a sentence's part. The rest is what no effect that could be left out is:
+    parts of the law, and a motor's limit of current.
+    """
+    found: dict[int, str] = {}
+    rest: list[str] = []
+    law = loop.controller.law if isinstance(loop.controller, Sampled) else loop.controller
+    if not isinstance(law, LAWS):
+        rest.append(f"the law {type(law).__name__} is no kp and kd")
+    elif isinstance(law, PID) and np.any(np.asarray(law.Ki) != 0):
+        rest.append("an integral is no kp and kd")
+    elif isinstance(law, Servo) and np.any(np.asarray(law.deadband) != 0):
+        rest.append("a deadband is no kp and kd")
+    for k, effect in enumerate(loop.effects):
+        if isinstance(effect, DCMotor) and math.isfinite(float(effect.limit)):
+            rest.append("forcerange limits the command, and a current limit braking as well")
+        elif not isinstance(effect, SAID):
+            found[k] = _reason(effect)
+    return found | ({-1: "; ".join(rest)} if rest else {})
+
+
+def _reason(effect: AbstractEffect) -> str:
+    if isinstance(effect, Stribeck):
+        return "frictionloss does not fall with speed"
+    if isinstance(effect, GearFriction | LoadDependentFriction):
+        return "frictionloss does not grow with the load"
+    if isinstance(effect, AbstractTransmission):
+        return "drive and link are one joint, with nothing that gives way between them"
+    if effect.on_link:
+        return "it is on the link, not on its drive: put it among the bodies"
+    return "there is no term for it"
+
+
+def _delivered(
+    loop: ClosedLoop,
+    command: Float[Array, " joints"],
+    v: Float[Array, " joints"],
+) -> Float[Array, " joints"]:
+    """What drives that can be said make of a command at a speed, `(joints,)`."""
+    still = jnp.zeros_like(v)
+    for effect in loop.effects:
+        if isinstance(effect, DCMotor | DriveGain | TorqueSaturation):
+            label, zero = jnp.asarray(NOBODY), jnp.zeros(())
+            motion = Motion(zero, still, v, still, command, effect.initial_state(), label)
+            command = effect.command(motion)
+    return command
+
+
+def _delivered_slopes(loop: ClosedLoop) -> Float[np.ndarray, "joints joints"]:
+    """How the torque of the drives falls with speed while nothing is commanded."""
+    still = jnp.zeros(loop.joints)
+    return np.asarray(jax.jacfwd(lambda v: _delivered(loop, still, v))(still))
+
+
+def _gains(
+    loop: ClosedLoop,
+    law: AbstractController,
+    limit: Float[np.ndarray, " joints"],
+    told: dict[str, Float[np.ndarray, " joints"]],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """kp, kd and the limit of the torque, `(joints,)` each."""
+    still = jnp.zeros(loop.joints)
+    held = {name: jnp.asarray(x) for name, x in told.items() if name != "on"}
+
+    def torque(error: Float[Array, " joints"], v: Float[Array, " joints"]):
+        reading = Reading(-error, v)
+        state = jnp.zeros_like(law.initial_state(reading))
+        reference = Reference(still, still, still, still, held)
+        mass = jnp.eye(loop.joints)
+        command = jnp.clip(law.command(reading, reference, state, mass), -limit, limit)
+        return _delivered(loop, command, still)
+
+    # A little beyond a deadband, within which nothing has a slope.
+    near = still + 1e-9 + (law.deadband if isinstance(law, Servo) else 0.0)
+    by_error, by_speed = jax.jacfwd(torque, argnums=(0, 1))(near, still)
+    most = np.asarray(torque(still + _FAR, still))
+    kp, kd = np.diagonal(np.asarray(by_error)), -np.diagonal(np.asarray(by_speed))
+    return kp, kd, np.where(most > 0.5 * _FAR * np.maximum(kp, 1e-30), np.inf, most)
