@@ -77,7 +77,9 @@ if _TYPE_CHECKING:
     from .discovery import Discovery as Discovery
     from .discovery import Fleet as Fleet
     from .discovery import FleetRobot as FleetRobot
+    from .discovery import ModelDifference as ModelDifference
     from .discovery import compare as compare
+    from .discovery import compare_models as compare_models
     from .discovery import diagnose as diagnose
     from .discovery import discover as discover
     from .discovery import discover_all as discover_all
@@ -87,6 +89,7 @@ if _TYPE_CHECKING:
     from .excitation import Limits as Limits
     from .excitation import PlanarReach as PlanarReach
     from .excitation import optimal_excitation as optimal_excitation
+    from .notebook import explore as explore
     from .report import write_report as write_report
 
 # The rooms of the upper floors come with the first name that is asked of them: a program that
@@ -98,7 +101,9 @@ _LATER = {
         "Discovery",
         "Fleet",
         "FleetRobot",
+        "ModelDifference",
         "compare",
+        "compare_models",
         "diagnose",
         "discover",
         "discover_all",
@@ -106,6 +111,7 @@ _LATER = {
         "simulator_terms",
     ),
     "excitation": ("Excitation", "Limits", "PlanarReach", "optimal_excitation"),
+    "notebook": ("explore",),
     "report": ("write_report",),
 }
 _ROOM_OF = {name: room for room, names in _LATER.items() for name in names}

@@ -131,7 +131,7 @@ def test_the_recording_that_an_effect_is_on_is_named(offset_case, offset_story):
     assert shown.endswith(f" kg in {name}")
     steps = with_chain(offset_case, start, payload)
     story = jaxid.Discovery("explained", tuple(steps))
-    assert f"The model lacked payload in {name};" in story.sentence
+    assert f"The model lacked payload in {name} (probability " in story.sentence
     assert f"payload in {name} (probability" in repr(story)
     assert story.to_dict()["added"][0]["recordings"] == [name]
 

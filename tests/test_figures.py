@@ -32,6 +32,10 @@ def _comparison() -> go.Figure:
     )
 
 
+def _before_after() -> go.Figure:
+    return figures.before_after(TIME, WAVE, 0.9 * WAVE, 0.8 * WAVE, 0.05)
+
+
 def _error_bars() -> go.Figure:
     values = np.array([[2.4, 3.9], [2.5, 4.0], [2.6, 4.1]])
     return figures.error_bars(
@@ -78,6 +82,10 @@ DRAWINGS = {
     "comparison": (
         _comparison,
         2 * ["measured", "simulated", "residual", "autocorrelation"],
+    ),
+    "before_after": (
+        _before_after,
+        ["measured", "before", "before", "after", "after", "noise"],
     ),
     "error_bars": (_error_bars, ["fit_1", "fit_2", "held out", "noise floor"]),
     "error_falling": (
@@ -235,7 +243,29 @@ def test_parameter_of_value_zero_has_a_finite_bar():
     assert figure.layout.yaxis.ticktext[0] == "<b>ZZ1r</b>  3.400 ± 0.020 kg·m²"
 
 
-def test_many_joints_put_the_legend_beside_the_axes():
-    errors = np.ones((3, 7))
-    figure = figures.error_falling(["a", "b", "c"], {"fitted": errors, "held out": errors})
-    assert figure.layout.legend.orientation == "v"
+def test_many_joints_share_a_short_legend():
+    errors = np.ones((3, 6))
+    steps = ["start", "+ position_dependent_friction on joint 2", "c"]
+    series = {"fitted": errors, "held out": errors}
+    figure = figures.error_falling(steps, series, np.ones(6))
+    shown = [trace.name for trace in figure.data if trace.showlegend is not False]
+    joints = [f"joint {j}" for j in range(1, 7)]
+    assert shown == [*joints, "fitted", "held out", "noise floor"]
+    # Words are whole.
+    assert figure.layout.xaxis.ticktext[1].split("<br>") == [
+        "+ position",
+        "dependent",
+        "friction on",
+        "joint 2",
+    ]
+
+
+def test_before_and_after_are_on_one_axis():
+    figure = _before_after()
+    by_name = {(t.name, t.yaxis): np.asarray(t.y) for t in figure.data}
+    assert np.allclose(by_name["before", "y2"], 0.2 * WAVE, atol=1e-6)
+    assert np.allclose(by_name["after", "y2"], 0.1 * WAVE, atol=1e-6)
+    (band,) = figure.layout.shapes
+    assert (band.y0, band.y1) == (-0.05, 0.05)
+    shown = [trace.name for trace in figure.data if trace.showlegend is not False]
+    assert shown == ["measured", "before", "after", "noise"]

@@ -31,7 +31,7 @@ FLOORS = (
     {"exporting", "robots", "simulation"},
     {"estimate", "excitation", "noise"},
     {"discovery"},
-    {"cli", "report"},
+    {"cli", "notebook", "report"},
     # The package's own namespace, and `python -m jaxid`.
     {"", "__main__"},
 )

@@ -1,4 +1,7 @@
-"""The page in a real browser: it draws, sorts, zooms and prints, and asks nothing of a network."""
+"""The page in a real browser: it draws, sorts, zooms and prints, and asks nothing of a network.
+
+Figures in sight are drawn without scrolling; those of joints that are not chosen when they are.
+"""
 
 import shutil
 from collections.abc import Iterator
@@ -18,10 +21,24 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not 
 pytestmark = [pytest.mark.xdist_group("demo"), pytest.mark.slow]
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
-DRAWN = """() => [...document.querySelectorAll("[data-figure]")].every(
+DRAWN = """() => [...document.querySelectorAll("[data-figure]")].filter(
+    (box) => box.offsetParent !== null).every(
     (box) => box.querySelector(".main-svg .plot, .main-svg .cartesianlayer path"))"""
-RANGES = """() => [...document.querySelectorAll("[data-linked]")].map(
-    (box) => box.layout.xaxis.range)"""
+RANGE = """() => [...document.querySelectorAll("[data-linked]")].find(
+    (box) => box.offsetParent !== null).layout.xaxis.range"""
+# Figures that are wider than their box, or whose legend reaches into the axes.
+CUT_OFF = """() => [...document.querySelectorAll("[data-figure]")].filter((box) => {
+    if (box.offsetParent === null) return false;
+    const own = box.getBoundingClientRect();
+    const legend = box.querySelector(".legend .bg")?.getBoundingClientRect();
+    const axes = box.querySelector(".nsewdrag").getBoundingClientRect();
+    return own.right > document.documentElement.clientWidth + 1
+        || [...box.querySelectorAll("text")].some((text) => {
+            const place = text.getBoundingClientRect();
+            return place.left < own.left - 1 || place.right > own.right + 1;
+        })
+        || (legend && legend.bottom > axes.top + 1 && legend.left < axes.right);
+}).map((box) => box.getAttribute("aria-label"))"""
 
 
 @pytest.fixture(scope="module")
@@ -69,14 +86,18 @@ def opened(browser: Any) -> Opened:
     return Opened(browser)
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(1200, "light"), (1200, "dark"), (400, "light")])
+@pytest.mark.parametrize(("width", "scheme"), [(1200, "light"), (1200, "dark"), (390, "light")])
 def test_it_draws_without_complaint_or_request(browser: Any, width: int, scheme: str) -> None:
     window = Opened(browser, width, scheme)
     assert window.said == []
     assert window.asked == [told().page.as_uri()]
     # Nothing hangs over the edge; wide figures and tables scroll in boxes of their own.
     assert window.page.evaluate("document.documentElement.scrollWidth") <= width
-    assert window.page.locator("[data-figure]").count() >= 8
+    assert window.page.evaluate(CUT_OFF) == []
+    # One of them is in sight without scrolling.
+    frame = window.page.locator("[data-figure]:visible").first.bounding_box()
+    assert frame is not None
+    assert frame["y"] + frame["height"] / 2 < 900
     back = window.page.evaluate("getComputedStyle(document.body).backgroundColor")
     light = sum(int(x) for x in back.removeprefix("rgb(").removesuffix(")").split(","))
     assert light > 700 if scheme == "light" else light < 100
@@ -88,25 +109,25 @@ def _column(table: Any, k: int) -> list[str]:
 
 
 def test_tables_sort_by_mouse_and_by_keyboard(opened: Opened) -> None:
-    table = opened.page.locator("table", has_text="parameters of the final model")
-    names, values = _column(table, 0), _column(table, 1)
+    table = opened.page.locator("table", has_text="parameters before and after")
+    names, values = _column(table, 0), [x.split("\u00a0")[0] for x in _column(table, 2)]
     by_value = sorted(names, key=lambda name: float(values[names.index(name)].replace("−", "-")))
-    table.get_by_role("button", name="value").click()
+    table.get_by_role("button", name="after").click()
     assert _column(table, 0) == by_value[::-1]
     opened.page.keyboard.press("Enter")
     assert _column(table, 0) == by_value
-    head = table.locator("th").nth(1)
+    head = table.locator("th").nth(2)
     assert head.get_attribute("aria-sort") == "ascending"
     table.get_by_role("button", name="parameter").focus()
     opened.page.keyboard.press("Space")
     assert _column(table, 0) == sorted(names, key=str.casefold, reverse=True)
 
 
-def test_zoom_is_linked_over_signals_and_obeys_the_keyboard(opened: Opened) -> None:
+def test_joints_share_their_zoom_which_obeys_mouse_keys_and_buttons(opened: Opened) -> None:
     page = opened.page
-    whole = page.evaluate(RANGES)
-    assert len(whole) == 2
-    box = page.locator("[data-linked]").first
+    whole = page.evaluate(RANGE)
+    span = whole[1] - whole[0]
+    box = page.locator("[data-linked]:visible")
     box.scroll_into_view_if_needed()
     frame = box.locator(".nsewdrag").first.bounding_box()
     assert frame is not None
@@ -116,18 +137,41 @@ def test_zoom_is_linked_over_signals_and_obeys_the_keyboard(opened: Opened) -> N
     page.mouse.move(x + frame["width"] / 4, y, steps=4)
     page.mouse.up()
     page.wait_for_timeout(300)
-    first, second = page.evaluate(RANGES)
-    assert first == second
-    span = whole[0][1] - whole[0][0]
-    assert first[0] == pytest.approx(whole[0][0] + span / 4, abs=0.02 * span)
-    assert first[1] == pytest.approx(whole[0][0] + span / 2, abs=0.02 * span)
-    # All panels of a figure share its axis of time.
-    assert box.evaluate("box => box.layout.xaxis3.range[1]") == first[1]
-    box.focus()
-    page.keyboard.press("ArrowRight")
+    first = page.evaluate(RANGE)
+    assert first[0] == pytest.approx(whole[0] + span / 4, abs=0.02 * span)
+    assert first[1] == pytest.approx(whole[0] + span / 2, abs=0.02 * span)
+    # Residuals share their axis of time with the signals.
+    assert box.evaluate("box => box.layout.xaxis2.range[1]") == first[1]
+    chosen = page.locator("input[name=joint]:checked")
+    assert chosen.get_attribute("value") == "2"
+    chosen.focus()
+    page.keyboard.press("ArrowLeft")
+    page.locator("[data-panel='1'] .main-svg").first.wait_for()
+    assert not page.locator("[data-panel='2']").is_visible()
+    assert page.evaluate(RANGE) == first
+    page.get_by_role("button", name="later").click()
+    page.wait_for_timeout(300)
+    assert page.evaluate(RANGE)[0] > first[0]
+    page.locator("[data-linked]:visible").focus()
     page.keyboard.press("0")
     page.wait_for_timeout(300)
-    assert page.evaluate(RANGES) == whole
+    assert page.evaluate(RANGE) == pytest.approx(whole, abs=0.02 * span)
+    page.get_by_role("radio", name="joint 2").check()
+    page.wait_for_timeout(300)
+    assert page.evaluate(RANGE) == whole
+
+
+def test_an_accessibility_checker_finds_nothing_serious(browser: Any) -> None:
+    checker = pytest.importorskip("axe_playwright_python.sync_playwright")
+    for scheme in ("light", "dark"):
+        window = Opened(browser, 390, scheme)
+        for folded in window.page.locator("summary").all():
+            folded.click()
+        found = checker.Axe().run(window.page).response
+        assert len(found["passes"]) > 15
+        serious = [v for v in found["violations"] if v["impact"] in ("serious", "critical")]
+        assert [(v["id"], v["nodes"][0]["html"]) for v in serious] == []
+        window.page.close()
 
 
 def test_figures_follow_a_change_of_theme(opened: Opened) -> None:
@@ -141,10 +185,18 @@ def test_figures_follow_a_change_of_theme(opened: Opened) -> None:
     assert opened.page.evaluate(ink) == light
 
 
-def test_it_prints_what_is_folded_away(opened: Opened) -> None:
-    assert len(opened.page.pdf(format="A4")) > 50_000
+def test_it_prints_what_is_folded_away_and_all_joints(opened: Opened) -> None:
+    page = opened.page
+    assert len(page.pdf(format="A4")) > 50_000
     folded = "document.querySelectorAll('details:not(.raw):not([open])').length"
-    assert opened.page.evaluate(folded) == 0
+    assert page.evaluate(folded) == 0
+    assert page.locator("[data-panel] .main-svg").count() >= 2
+    page.emulate_media(media="print")
+    for condition in ("before", "after"):
+        page.evaluate(f"dispatchEvent(new Event('{condition}print'))")
+        shown = [panel.is_visible() for panel in page.locator("[data-panel]").all()]
+        assert shown.count(True) == (2 if condition == "before" else 1)
+    page.emulate_media(media="screen")
     assert opened.said == []
 
 
@@ -209,10 +261,11 @@ def test_figures_far_below_are_drawn_when_one_goes_there(browser: Any) -> None:
         " if (!window.begun) { window.begun = true; setTimeout(call, 0); } return 0; }"
     )
     page.goto(told().page.as_uri())
-    last = page.locator("[data-figure]").last
+    last = page.locator("[data-figure]:visible").last
     page.locator("[data-figure][data-drawn]").first.wait_for()
     assert last.get_attribute("data-drawn") is None
     last.scroll_into_view_if_needed()
     last.locator(".main-svg").first.wait_for()
-    assert not page.evaluate(DRAWN)
+    # Nobody has chosen the other joint.
+    assert page.locator("[data-panel='1'] [data-drawn]").count() == 0
     page.close()

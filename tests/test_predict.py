@@ -77,7 +77,7 @@ def test_prediction_is_the_refit(found, predictor, effects):
 
 def test_finite_effects_are_simulated(found, predictor):
     soft = jaxid.effects.JointElasticity(joint=2, compliance=2e-3, rotor=0.02)
-    shown = predictor._shown(soft)
+    shown = predictor.shown(soft)
     fit, _, _ = found
     moved = [r.tau for r in jaxid.simulate(fit.loop.add(soft), fit.recordings)]
     plain = [r.tau for r in jaxid.simulate(fit.loop, fit.recordings)]

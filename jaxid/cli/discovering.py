@@ -148,6 +148,8 @@ def discover(
             story.save(save)
         if report is not None:
             write_report(story, report)
+        if story.interrupted:
+            raise KeyboardInterrupt
     if story.verdict == "undetermined":
         raise typer.Exit(UNDETERMINED)
 

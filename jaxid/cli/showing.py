@@ -2,6 +2,7 @@
 
 import os
 import sys
+import textwrap
 from typing import Any
 
 import typer
@@ -22,8 +23,10 @@ def tell(story: Any, quiet: bool = False) -> None:
     """Prints a discovery: its verdict, and all of it where that is wanted."""
     verdict, _, rest = repr(story).partition("\n")
     colour = "green" if story.verdict in ("adequate", "explained") else "yellow"
-    say(verdict, bold=True, fg=colour)
-    if not quiet:
+    if quiet:
+        say(verdict, bold=True, fg=colour)
+    else:
+        say(textwrap.fill(verdict, 80, break_on_hyphens=False), bold=True, fg=colour)
         typer.echo(rest)
 
 

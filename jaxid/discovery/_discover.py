@@ -7,18 +7,16 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ..display.progress import working
+from ..display.progress import live_figure, working
 from ..effects import AbstractEffect
 from ..effects import catalogue as known
-from ..errors import FitError, RecordingError
+from ..errors import FitError
 from ..estimate import OEM, Status
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
-from .asked import Asked
+from .asked import Asked, check_apart
 from .comparison import compare
 from .hypotheses import effect_on
 from .landscape import form
@@ -28,6 +26,7 @@ from .search import Search
 from .story import Discovery, Step
 from .verdict import Outcome, misfit_of, refuted, risen, undecided
 
+_STOPPED = "it was interrupted before its end; resume=... goes on from saved steps"
 # Weight from which a rival's error on held-out recordings is worth a simulation.
 _SHOWN = 0.01
 
@@ -61,6 +60,9 @@ def discover(
     - `most`: how many effects to add at the most.
     - `resume`: a folder in which every fit is saved as it ends, and from which the same call
       goes on; it is made where it is not there.
+    - `progress`: show what is tried and the time left, in a notebook also the error of each model.
+
+    Ctrl-C ends the search, once there is a fit, with the best model so far (`interrupted`).
 
     **Raises:** `FitError`, `ModelError`, `RecordingError` where model and recordings do not fit;
     also where they were sampled at different rates; `SaveError` where the folder holds steps of
@@ -76,7 +78,7 @@ def discover(
     recordings = Recordings.of(recordings)
     held_out = None if validate is None else Recordings.of(validate)
     Recordings.of([*recordings, *(held_out or ())]).common_period()
-    _check_apart(recordings, held_out or ())
+    check_apart(recordings, held_out or ())
     asked = Asked(
         recordings, held_out, method or OEM(), tuple(catalogue), significance, worth, most
     )
@@ -86,17 +88,24 @@ def discover(
             resume, {"loop": loop, "search": asked.plan()}, classes_of(loop) | asked.classes()
         ) as campaign,
     ):
-        search = Search(asked, campaign, say)
-        verdict, unfinished = search.run(loop)
+        search = Search(asked, campaign, say, live_figure(progress))
+        try:
+            verdict, unfinished = search.run(loop)
+        except KeyboardInterrupt:
+            if not search.stopped():
+                raise
+            return _told(search, "undetermined", False, started, interrupted=True)
         return _told(search, verdict, unfinished, started)
 
 
-def _told(search: Search, verdict: Outcome, unfinished: bool, started: float) -> Discovery:
+def _told(
+    search: Search, verdict: Outcome, unfinished: bool, started: float, interrupted: bool = False
+) -> Discovery:
     """What was found, step by step, held against recordings that no fit has seen."""
     models = search.visited.weighed(search.at)
     steps = _steps(search, models)
     models = _held_out(search, models, steps)
-    reason = _raised(search, steps)
+    reason = _STOPPED if interrupted else _raised(search, steps)
     if not unfinished and not reason:
         reason = _doubt(search, verdict, steps, models)
     notes = (*remarks(steps, search.given), *search.failures)
@@ -111,6 +120,7 @@ def _told(search: Search, verdict: Outcome, unfinished: bool, started: float) ->
         notes=notes,
         seconds=time.perf_counter() - started,
         unfinished=unfinished,
+        interrupted=interrupted,
     )
 
 
@@ -195,14 +205,3 @@ def _alike(search: Search, model: Model, added: AbstractEffect) -> tuple[Named, 
     last = next(e for e in search.at.effects if form(e) == form(added))
     found = (*search.visited.alike(model, added), *search.visited.alike(search.at, last))
     return tuple(dict.fromkeys(n for n in found if n not in search.at.names))
-
-
-def _check_apart(recordings: Recordings, held_out: Iterable[Recording]) -> None:
-    """Raises `RecordingError` where what is held out was fitted as well, whatever its name."""
-    for unseen in held_out:
-        for fitted in recordings:
-            if np.array_equal(unseen.q, fitted.q) and np.array_equal(unseen.tau, fitted.tau):
-                raise RecordingError(
-                    f"{unseen.name} is held out and has the samples of {fitted.name}, which is "
-                    "fitted: what judges a model must not have made it"
-                )

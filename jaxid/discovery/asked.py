@@ -1,11 +1,14 @@
 """What a discovery was asked."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 
+from ..errors import RecordingError
 from ..estimate import OEM
-from ..recording import Recordings
+from ..recording import Recording, Recordings
 from ..storage.classes import classes_of
 from .verify import quiet
 
@@ -43,3 +46,14 @@ def _entry(entry: Any) -> Any:
     """An entry of a catalogue as a plan names it: classes and functions by their names."""
     name = getattr(entry, "__qualname__", None)
     return entry if name is None else f"{entry.__module__}.{name}"
+
+
+def check_apart(recordings: Recordings, held_out: Iterable[Recording]) -> None:
+    """Raises `RecordingError` where what is held out was fitted as well, whatever its name."""
+    for unseen in held_out:
+        for fitted in recordings:
+            if np.array_equal(unseen.q, fitted.q) and np.array_equal(unseen.tau, fitted.tau):
+                raise RecordingError(
+                    f"{unseen.name} is held out and has the samples of {fitted.name}, which is "
+                    "fitted: what judges a model must not have made it"
+                )

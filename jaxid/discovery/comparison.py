@@ -80,6 +80,17 @@ class Comparison(AbstractShown):
         rows = np.asarray(band.rows)[k][np.asarray(band.keep)[k]]
         return record.time[rows], measured, simulated
 
+    def shown(self, recording: int | str = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `judged`, for a figure: NaN where a joint stands still and nothing is compared.
+
+        **Arguments:**
+
+        - `recording`: number from 0, or name.
+        """
+        time, measured, simulated = self.judged(recording)
+        blank = np.where((measured == 0) & (simulated == 0), np.nan, 0.0)
+        return time, measured + blank, simulated + blank
+
     @property
     def residuals(self) -> tuple[Float[np.ndarray, "_samples joints"], ...]:
         """Measured less simulated as they are compared, one `(samples, joints)` a recording."""
@@ -115,10 +126,7 @@ class Comparison(AbstractShown):
         from ..display import figures
 
         k = self._index(recording)
-        time, measured, simulated = self.judged(k)
-        # Where a joint stands still there is nothing to compare, and no line to draw.
-        blank = np.where((measured == 0) & (simulated == 0), np.nan, 0.0)
-        measured, simulated = measured + blank, simulated + blank
+        time, measured, simulated = self.shown(k)
         acf, bound = self.autocorrelation(k)
         torque, position = self.loop.arm.units()
         units = position if self.signal == "position" else torque

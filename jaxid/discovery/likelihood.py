@@ -53,6 +53,14 @@ def score_of(fit: Fit, size: int = 0, offered: int = 0) -> Score:
     return _scored(series, len(fit.names), price(size, offered))
 
 
+def noise_filters(
+    residuals: Sequence[Float[np.ndarray, "_samples joints"]],
+) -> tuple[ARFilter, ...]:
+    """The noise filters of residuals, one a joint, as a score has them."""
+    joints = range(residuals[0].shape[1])
+    return tuple(filter_of([r[:, j] for r in residuals], _HIGHEST) for j in joints)
+
+
 def _scored(series: Sequence[Sequence[np.ndarray]], freedom: int, paid: float) -> Score:
     # Rows at which a joint stands still are zero, and none that count.
     total = sum(np.count_nonzero(s) for rows in series for s in rows)

@@ -109,6 +109,20 @@ def named(effect: AbstractEffect) -> Named:
     return effect.effect_name(), getattr(effect, "joint", None)
 
 
+def listed(effects: Sequence[AbstractEffect]) -> str:
+    """Effects with their joints, as a sentence lists them."""
+    return " and ".join(effect_on(*named(e)) for e in effects)
+
+
+def piece_name(effects: Sequence[AbstractEffect]) -> str:
+    """The name of a set's refit among saved pieces; forms of one name are told apart."""
+    parts = []
+    for e in effects:
+        name, joint, kind = form(e)
+        parts.append(f"{name} {joint or ''} {kind}")
+    return f"with {', '.join(parts)}"
+
+
 class Visited:
     """All models that were looked at, each at its best score: a refit's, else a prediction's."""
 

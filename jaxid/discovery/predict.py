@@ -113,6 +113,22 @@ class Predictor(eqx.Module):
         found, _, _ = descend(at, at(y), y, limits, fill, rows, settings)
         return self._ended(found)
 
+    def change(self, effect: AbstractEffect) -> Float[np.ndarray, "recordings samples outputs"]:
+        """What an effect at its values does to the output, N·m or N (rad or m in an open loop)."""
+        if not effect.finite:
+            return self.shown(effect)[..., 0]
+        system = self.system
+        nominal = system.linear.seen[:, :, system.row]
+        (found,) = differences(system.loop, system.batch, [effect], system.row, nominal)
+        return at_samples(system.batch, np.asarray(found))
+
+    def absorbed(
+        self, left: Float[np.ndarray, "recordings samples outputs"]
+    ) -> Float[np.ndarray, " absorbed"]:
+        """How far the base's values move to explain what of a residual they can."""
+        white = self.data.white(left, self.noise).reshape(-1)
+        return least_squares(self.basis.T @ white, self.base, self.limits)[0]
+
     def _reached(self, effects: tuple[AbstractEffect, ...]) -> "_Reached":
         shown = [self.shown(effect) for effect in effects]
         none = np.zeros((*self.data.residual.shape, 1))

@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..display.progress import working
-from ..effects import AbstractEffect, AbstractTransmission
+from ..effects import AbstractEffect, AbstractTransmission, Scene
 from ..effects import catalogue as known
 from ..errors import FitError
 from ..estimate import Fit
+from ..recording import Recordings
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from .comparison import Comparison
@@ -63,17 +64,7 @@ def screen(fit: Fit | Comparison, catalogue: Sequence[Any], say: Callable[[str],
     say("linearising along the recordings")
     system = System.of(fit)
     loop, linear = system.loop, system.linear
-    time = np.asarray(at_rows(system.batch, linear.motion.t))
-    tones, trials = _tones(system.residual, system.mask, float(np.median(np.diff(time[0]))))
-    scene = survey(loop, fit.recordings, linear.motion, tones)
-    proposed = candidates(catalogue, scene, trials)
-    parted = {e.joint for e in loop.effects if isinstance(e, AbstractTransmission)}
-    proposed = [
-        (effect, tests)
-        for effect, tests in proposed
-        if not (isinstance(effect, AbstractTransmission) and effect.joint in parted)
-        and _can_be_told(loop, effect)
-    ]
+    scene, proposed = offered(system, fit.recordings, catalogue)
     proposed += [(curve, 1.0) for curve in curves(scene, linear.motion)]
     hypotheses, table = signatures(loop, system.batch, linear, proposed, system.row, say)
     _check_finite(loop, hypotheses, table)
@@ -85,6 +76,30 @@ def screen(fit: Fit | Comparison, catalogue: Sequence[Any], say: Callable[[str],
     )
     say(f"scoring {len(hypotheses)} hypotheses")
     return Screened(system, tuple(hypotheses), data, scene)
+
+
+def offered(
+    system: System, recordings: Recordings, catalogue: Sequence[Any]
+) -> tuple[Scene, list[tuple[AbstractEffect, float]]]:
+    """What of a catalogue can be asked of a model, with how many settings each stands for.
+
+    **Arguments:**
+
+    - `system`: of the fitted model. `recordings`: that it was fitted to.
+    - `catalogue`: as for `diagnose`.
+    """
+    loop, motion = system.loop, system.linear.motion
+    time = np.asarray(at_rows(system.batch, motion.t))
+    tones, trials = _tones(system.residual, system.mask, float(np.median(np.diff(time[0]))))
+    scene = survey(loop, recordings, motion, tones)
+    parted = {e.joint for e in loop.effects if isinstance(e, AbstractTransmission)}
+    proposed = [
+        (effect, tests)
+        for effect, tests in candidates(catalogue, scene, trials)
+        if not (isinstance(effect, AbstractTransmission) and effect.joint in parted)
+        and _can_be_told(loop, effect)
+    ]
+    return scene, proposed
 
 
 def _can_be_told(loop: ClosedLoop, effect: AbstractEffect) -> bool:

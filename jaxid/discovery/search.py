@@ -18,16 +18,16 @@ from ..storage.campaign import Campaign
 from .asked import Asked
 from .diagnosis import Diagnosis, over_recordings, share_left
 from .explore import DECISIVE, Candidate, explore, key_of
-from .hypotheses import effect_on
-from .landscape import Landscape, form, forms_of
+from .landscape import Landscape, forms_of
 from .likelihood import price, score_of
-from .models import Model, Named, Visited, named
+from .models import Model, Named, Visited, listed, piece_name
 from .ranking import Screened, judge
 from .release import released
 from .screening import screen
 from .support import unsupported
 from .verdict import Outcome
 from .verify import Refits, is_there, needed
+from .watched import ROUND, Watched
 
 # Sets that are refitted in one round, and the share of what the best gains by which predictions
 # are off.
@@ -43,8 +43,14 @@ _BLURRED = 0.25
 class Search:
     """A search under way: which models were looked at, and which is the best."""
 
-    def __init__(self, asked: Asked, campaign: Campaign, say: Callable[[str], None]) -> None:
-        self.asked, self.campaign, self.say = asked, campaign, say
+    def __init__(
+        self,
+        asked: Asked,
+        campaign: Campaign,
+        say: Callable[..., None],
+        draw: Callable[[Callable[[], Any]], None] = lambda make: None,
+    ) -> None:
+        self.asked, self.campaign, self.watched = asked, campaign, Watched(say, draw)
         self.refits = Refits(asked.recordings, asked.method)
         self.visited = Visited()
         self.forms = 0
@@ -76,15 +82,23 @@ class Search:
             self._screened(self.at.fit, self.at.effects)
         return outcome
 
+    def stopped(self) -> bool:
+        """Ends with the best model that was fitted so far; False where there is none."""
+        fitted = self.visited.ranked(lambda m: m.fit is not None)
+        if fitted:
+            self.at = fitted[0]
+        return bool(fitted)
+
     def _start(self, loop: ClosedLoop) -> Model:
         """The starting model, fitted with the noise known."""
-        self.say("fit of the starting model")
+        self.watched.begin("fit", "fit of the starting model")
         first = self.campaign.piece("start", lambda: self.refits.first(loop))
         # A recording along which the first fit runs away is left out of all that follows.
         self.refits = dataclasses.replace(self.refits, recordings=first.recordings)
         _, diagnosis = self._screened(first, ())
         # Where noise is strongly coloured, plain output error leaves the parameters far off. A
         # filter fitted to the residual itself would take what is missing for noise.
+        self.watched.begin("fit", "fit of the starting model, with its noise known")
         again = self.campaign.piece(
             "start, filtered", lambda: self.refits.filtered(first.loop, diagnosis.noise)
         )
@@ -95,7 +109,8 @@ class Search:
 
     def _screened(self, fit: Fit, effects: Sequence[AbstractEffect]) -> tuple[Screened, Diagnosis]:
         """The linear system at a fit with its signatures, and the diagnosis, which is kept."""
-        screened = screen(fit, self.asked.catalogue, self.say)
+        self.watched.begin("screen", "where the model fails")
+        screened = screen(fit, self.asked.catalogue, self.watched.say)
         diagnosis = judge(fit, screened, self.asked.significance)
         self.forms = max(self.forms, forms_of(screened.hypotheses))
         self.diagnoses[key_of(effects)] = diagnosis.light()
@@ -111,7 +126,8 @@ class Search:
         landscape = Landscape.of(screened.system, data, screened.hypotheses, diagnosis.noise)
         # At the most that was asked, one more is looked for, to say whether something is left.
         left = min(max(self.asked.most - len(at.effects), 1), _AHEAD)
-        candidates = explore(landscape, left, self.say)
+        self.watched.begin("look", "sets of effects in the linear system")
+        candidates = explore(landscape, left, self.watched.say)
         self.seen = at.fit, landscape.predictor
         plain = next(c for c in candidates if not c.effects and c.curve is None)
         return [c for c in candidates if c is plain or self._matters(at, c, plain)], plain.score
@@ -129,9 +145,9 @@ class Search:
         effect = 0.0 if imposed(fit.loop) else max(nothing - min(single, default=np.inf), 0.0)
         if release is None or release.gain < effect:
             return None
-        self.say(f"fit with {release.said}")
+        self.watched.begin("fit", f"fit with {release.said}", ROUND)
         loop, noise = release.loop, candidates[0].noise
-        name = f"{_piece(at.effects)}, {release.said}"
+        name = f"{piece_name(at.effects)}, {release.said}"
         found = self.campaign.piece(name, lambda: self.refits.filtered(loop, noise))
         if not found.status.simulated:
             return None
@@ -171,7 +187,7 @@ class Search:
         fit, predictor = self.seen
         lacking = unsupported(predictor, c) if imposed(fit.loop) else ()
         if lacking:
-            said = f"{_listed(lacking)}: explains only the stretches from which it is estimated"
+            said = f"{listed(lacking)}: explains only the stretches from which it is estimated"
             self.failures = tuple(dict.fromkeys((*self.failures, said)))
         return not lacking
 
@@ -183,15 +199,15 @@ class Search:
         had = self.had(at, together)
         if had is not None:
             return had
-        self.say(f"fit with {_listed(asked.effects)}")
+        self.watched.begin("fit", f"fit with {listed(asked.effects)}", ROUND)
         try:
             fit = self.campaign.piece(
-                _piece(together),
+                piece_name(together),
                 lambda: self.refits.with_effects(before, asked.effects, asked.noise, promised),
             )
         except (ModelError, FitError) as error:
             # A candidate that cannot be simulated, at values that the linear system liked.
-            self.failures = (*self.failures, f"no fit with {_listed(asked.effects)}: {error}")
+            self.failures = (*self.failures, f"no fit with {listed(asked.effects)}: {error}")
             return None
         if not fit.status.simulated or not is_there(fit, before):
             return None
@@ -239,17 +255,18 @@ class Search:
         assert at.fit is not None
         loop, noise = at.fit.loop, at.noise
         kept = [e for e in loop.effects if not any(e is x for x in at.effects)]
-        self.say(f"fit with {_listed(effects) or 'nothing'} alone")
+        self.watched.begin("fit", f"fit with {listed(effects) or 'nothing'} alone")
         fit = self.campaign.piece(
-            _piece(effects),
+            piece_name(effects),
             lambda: self.refits.filtered(loop.with_effects((*kept, *effects)), noise),
         )
         return self._visit(self._added(fit), fit)
 
     def _visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
-        """A fitted model, noted."""
+        """A fitted model, noted and drawn."""
         model = self._judged(effects, fit)
         self.visited.add(model)
+        self.watched.fitted(model)
         return model
 
     def _judged(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
@@ -317,16 +334,3 @@ class Search:
 def _released(loop: ClosedLoop) -> set[str]:
     """Names of free parameters that are held by declaration."""
     return {p.name for p in loop.free_parameters if not p.declaration.free}
-
-
-def _listed(effects: Sequence[AbstractEffect]) -> str:
-    return " and ".join(effect_on(*named(e)) for e in effects)
-
-
-def _piece(effects: Sequence[AbstractEffect]) -> str:
-    """The name of a set's refit among saved pieces; forms of one name are told apart."""
-    parts = []
-    for e in effects:
-        name, joint, kind = form(e)
-        parts.append(f"{name} {joint or ''} {kind}")
-    return f"with {', '.join(parts)}"

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from ..compiling import compiled
 from ..effects import AbstractEffect, Motion
 from ..linear_algebra import exponential
-from ..parameters import Parameter, read_values, write_values
+from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..simulation.batch import Batch
 from ..simulation.dynamics import effect_loads
 from ..simulation.loop import ClosedLoop
@@ -149,20 +149,26 @@ def _force_by(
 
 @compiled
 def force_and_slopes(
-    placed: Placed, motion: Motion, left: Float[Array, "recordings points joints"]
+    placed: Placed,
+    motion: Motion,
+    left: Float[Array, "recordings points joints"],
+    fields: tuple[str, ...] | None = None,
 ) -> Forces:
     """What an effect adds along each run, and the slopes of that by its free parameters.
 
     **Arguments:**
 
     - `motion`: nominal, `(recordings, points)` first. `left`: torque left for the links, N·m or N.
+    - `fields`: names of the fields by which slopes are taken; by default those that are free.
 
     **Returns:** torque on the joint, N·m or N, position read, rad or m, and velocity read, rad/s or
     m/s; the first column is the value, the others are slopes.
     """
     effect = placed.effect
     free = free_of(effect)
-    values = read_values(effect, free)
+    if fields is not None:
+        free = tuple(p for p in list_parameters(effect) if p.place[-1] in fields)
+    values = read_values(effect, free) if free else jnp.zeros(0)
 
     def of_run(run: Motion, left) -> Forces:
         along = _force_by(effect, free, placed.motion(run), left[:, placed.order])

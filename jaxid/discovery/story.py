@@ -3,7 +3,7 @@
 import html
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,14 +16,18 @@ from ..effects import AbstractEffect, Curve
 from ..errors import ModelError
 from ..estimate import Fit
 from ..estimate.oem import oem_of
+from ..estimate.result import joint_columns
+from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from ..storage.saved import save
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
+from .effect_curve import EffectCurve, effect_curve
 from .floor import SPOKEN
 from .hypotheses import effect_on, on_recordings
 from .landscape import form
 from .models import Model, models_table, named, picked
+from .text import errors_table, models_lines, wrapped
 from .verdict import Outcome
 from .verify import Refits
 
@@ -32,8 +36,8 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
 
 
-# Weight from which another model is named beside the best.
-_NAMED = 0.01
+# Models that a notebook shows.
+_SHOWN = 8
 
 
 class Step(eqx.Module):
@@ -62,6 +66,7 @@ class Discovery(AbstractShown):
     - `considered`: the models that were looked at, best first.
     - `removed`: effects that were added and later found not to be needed.
     - `unfinished`: whether it stopped, as told, while an effect of the catalogue was still to add.
+    - `interrupted`: whether the search was interrupted; the last step is the best model until then.
     """
 
     verdict: Outcome = eqx.field(static=True)
@@ -72,6 +77,7 @@ class Discovery(AbstractShown):
     notes: tuple[str, ...] = eqx.field(static=True, default=())
     seconds: float = eqx.field(static=True, default=0.0)
     unfinished: bool = eqx.field(static=True, default=False)
+    interrupted: bool = eqx.field(static=True, default=False)
 
     @property
     def fit(self) -> Fit:
@@ -85,10 +91,8 @@ class Discovery(AbstractShown):
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """The diagnosis of the model at the end."""
-        found = self.steps[-1].diagnosis
-        assert found is not None
-        return found
+        """The diagnosis of the model at the end; of an interrupted search the last there is."""
+        return [step.diagnosis for step in self.steps if step.diagnosis is not None][-1]
 
     @property
     def first_diagnosis(self) -> Diagnosis:
@@ -101,6 +105,9 @@ class Discovery(AbstractShown):
     def sentence(self) -> str:
         """The verdict in a sentence for a colleague."""
         added = _spoken(self.steps)
+        if self.interrupted:
+            so_far = f"adds {' and '.join(added)}" if added else "is the starting model"
+            return f"The search was interrupted: the best model until then {so_far}."
         if self.verdict == "undetermined":
             best = f"the best model adds {' and '.join(added)}, but " if added else ""
             return (
@@ -112,7 +119,7 @@ class Discovery(AbstractShown):
         if self.verdict == "adequate":
             return (
                 f"The model of {self.loop.name} describes these recordings down to their noise: "
-                "nothing is missing."
+                f"nothing is missing{self._sure()}."
             )
         if self.unfinished:
             return (
@@ -121,19 +128,23 @@ class Discovery(AbstractShown):
             )
         if self.verdict == "explained":
             return f"The model lacked {' and '.join(added)}; with that, nothing is left to explain."
-        after = f" after adding {' and '.join(added)}" if added else ""
-        left = f"Something is left{after} that no effect of the catalogue explains"
+        lacked = f"The model lacked {' and '.join(added)}; " if added else ""
         if not self.diagnosis.depends_on():
-            return f"{left}."
+            return _upper(f"{lacked}no effect of the catalogue explains what is left.")
         hypothesis = self.diagnosis.where[0].hypothesis
         curve = hypothesis.effect
         assert isinstance(curve, Curve)
         on = "time" if curve.coordinate == "t" else f"the {curve.spoken_coordinate}"
         how = " and on the direction of motion" if curve.signed else ""
-        return (
-            f"{left}: the torque of joint {hypothesis.joint} depends on {on}{how} in a way the "
-            "model lacks."
+        return _upper(
+            f"{lacked}no effect of the catalogue explains how the torque of joint "
+            f"{hypothesis.joint}, as it is left, depends on {on}{how}."
         )
+
+    def _sure(self) -> str:
+        """The probability that the starting model suffices, as a sentence goes on."""
+        start = next((m for m in self.considered if not m.effects and m.curve is None), None)
+        return "" if start is None else f" (probability {odds(start.weight)})"
 
     def table(self) -> "pd.DataFrame":
         """Error by step and joint, on fitted and held-out recordings, %."""
@@ -177,6 +188,24 @@ class Discovery(AbstractShown):
             and len(m.effects) == step
             and sorted(m.names[:-1], key=str) == before
         )
+
+    def curve(
+        self,
+        effect: str | AbstractEffect,
+        joint: int | None = None,
+        recordings: Recording | Recordings | Iterable[Recording] | None = None,
+    ) -> EffectCurve:
+        """An effect of the last model over what it depends on, over the residual without it.
+
+        **Arguments:**
+
+        - `effect`: its name as in tables, or the effect itself, one of `loop.effects`.
+        - `joint`: on which it is, counted from 1; of an effect on all joints, the one to show.
+        - `recordings`: along which; those that were fitted by default.
+
+        **Raises:** as `effect_curve` does.
+        """
+        return effect_curve(self.fit, effect, joint, recordings)
 
     def choose(self, model: int | str) -> Fit:
         """Another model of the table `models`, fitted in full.
@@ -225,18 +254,20 @@ class Discovery(AbstractShown):
         """Relative error that a perfect model would leave on the fitted recordings, %."""
         return self.diagnosis.floor_percent()
 
-    def _floor(self) -> list[str]:
-        """The noise floor by joint, its interval where it was measured, and its source."""
-        measured, shown = self.diagnosis.measured, []
-        for j, value in enumerate(self.noise_floor_percent()):
-            interval = ""
+    def _floor_sources(self) -> list[str]:
+        """Where the noise floor is from, and its interval where it was measured."""
+        joints = joint_columns(self.loop.joints)
+        measured = self.diagnosis.measured
+        by_source: dict[str, list[str]] = {}
+        for j, (label, sources) in enumerate(
+            zip(joints, self.diagnosis.floor_sources(), strict=True)
+        ):
+            said = " and ".join(SPOKEN[s] for s in sources)
             if measured is not None and np.isfinite(measured.percent[:, j]).all():
                 low, high = (over_recordings(x)[j] for x in (measured.low, measured.high))
-                interval = f" ({low:.3f} to {high:.3f})"
-            shown.append(f"{value:.3f}{interval}")
-        sources = dict.fromkeys(s for joint in self.diagnosis.floor_sources() for s in joint)
-        said = " and ".join(SPOKEN[s] for s in sources)
-        return [f"noise floor, %: {', '.join(shown)}", f"  {said}"]
+                label = f"{label} ({low:.3g} to {high:.3g} %)"
+            by_source.setdefault(said, []).append(label)
+        return [f"noise floor {s}: {', '.join(labels)}" for s, labels in by_source.items()]
 
     def suggestion(self) -> Curve:
         """The free-form curve that explains most of what is left, ready to be added.
@@ -269,6 +300,7 @@ class Discovery(AbstractShown):
             "verdict": self.verdict,
             "reason": self.reason,
             "unfinished": self.unfinished,
+            "interrupted": self.interrupted,
             "ranking": self.first_diagnosis.to_dict()["ranking"],
             "added": [
                 {
@@ -294,9 +326,27 @@ class Discovery(AbstractShown):
         }
 
     def __repr__(self) -> str:
-        lines = [f"{self.verdict}: {self.sentence}", "relative error, %:"]
-        lines.append(self.table().to_string(float_format=lambda x: f"{x:.3f}"))
-        lines += self._floor()
+        steps = [
+            (s.label, _rms(s.fit.error_percent).tolist(), None)
+            if s.held_out is None
+            else (s.label, *(_rms(x.error_percent).tolist() for x in (s.fit, s.held_out)))
+            for s in self.steps
+        ]
+        lines = [
+            f"{self.verdict}: {self.sentence}",
+            "",
+            *errors_table(steps, self.noise_floor_percent().tolist()),
+            *(x for line in self._floor_sources() for x in wrapped(line)),
+        ]
+        found = self._found()
+        lines += ["", *(x for line in found for x in wrapped(line))] if found else []
+        if len(self.considered) > 1:
+            lines += ["", *models_lines(self.considered)]
+        return "\n".join([*lines, *(x for note in self.notes for x in wrapped(note))])
+
+    def _found(self) -> list[str]:
+        """Each added effect with its probability and values, and what it cannot be told from."""
+        lines = []
         for k, step in enumerate(s for s in self.steps if s.added is not None):
             values = _found_parameters(self.steps, k)
             shown = ", ".join(
@@ -309,36 +359,43 @@ class Discovery(AbstractShown):
             lines.append(f"{step_name(step)}{sure}: {shown}")
             if step.alike:
                 others = ", ".join(effect_on(n, j) for n, j in step.alike)
-                lines.append(f"  these recordings cannot tell it from {others}")
-        rivals = [m for m in self.considered if m.weight > _NAMED][1:]
-        if rivals:
-            shown = ", ".join(f"{m.label} ({m.weight:.2g})" for m in rivals)
-            lines.append(f"other models by their weight: {shown}")
-        return "\n".join([*lines, *self.notes])
+                lines.append(f"these recordings cannot tell {step_name(step)} from {others}")
+        return lines
 
     def _repr_html_(self) -> str:
         errors = self.table().rename(columns=lambda name: f"{name}, %")
         floor = ", ".join(f"{x:.3f} %" for x in self.noise_floor_percent())
-        found = repr(self).split("noise floor, %:")[1].split("\n")[1:]
+        found = (*self._found(), *self.notes)
         lines = "".join(f"<li>{html.escape(line)}</li>" for line in found)
+        models = self.models.head(_SHOWN).to_html(float_format="%.3g")
         return (
             f"<p><b>{html.escape(self.sentence)}</b></p><p>relative error by step</p>"
             f"{errors.to_html(float_format='%.3f')}<p>noise floor by joint: {floor}</p>"
-            f"<ul>{lines}</ul>"
+            f"<ul>{lines}</ul><p>models, best first</p>{models}"
         )
 
 
 def odds(share: float) -> str:
     """A probability that is no more certain than its digits."""
+    if share < 0.001:
+        return "< 0.001"
     return "> 0.999" if share > 0.999 else f"{share:.3g}"
 
 
+def _upper(sentence: str) -> str:
+    return sentence[:1].upper() + sentence[1:]
+
+
 def _spoken(steps: Sequence[Step]) -> list[str]:
-    """Added effects in words; what was added twice is said once."""
-    effects = [step.added for step in steps if step.added is not None]
-    counted = Counter(_placed(e.spoken(), e) for e in effects)
+    """Added effects in words with their probabilities; what was added twice is said once."""
+    added = [(step.added, step.probability) for step in steps if step.added is not None]
+    counted = Counter(_placed(e.spoken(), e) for e, _ in added)
+    sure = {_placed(e.spoken(), e): odds(share) for e, share in added}
     often = {1: "", 2: " twice"}
-    return [name + often.get(n, f" {n} times") for name, n in counted.items()]
+    return [
+        f"{name}{often.get(n, f' {n} times')} (probability {sure[name]})"
+        for name, n in counted.items()
+    ]
 
 
 def step_name(step: Step) -> str:

@@ -1,15 +1,112 @@
-"""A line on the terminal while something works."""
+"""What works and how long it still takes: lines on a terminal, a line in a notebook."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+import html
+import json
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+# Updates of a notebook's line in a second, and of a terminal's.
+_RATE = 4
+_BAR = 16
+
+
+class Line:
+    """The state of something that works: what it does, since when, and how long it still takes.
+
+    **Arguments:**
+
+    - `title`: of all of it.
+    """
+
+    def __init__(self, title: str) -> None:
+        self.title, self.text = title, ""
+        self.began = time.perf_counter()
+        self.share: float | None = None
+        self._ends: float | None = None
+
+    def say(self, text: str, share: float | None = None, left: float | None = None) -> None:
+        """Takes what is being done, the share that is done, 0 to 1, and the time left, s.
+
+        The time left is counted down until another is given; of a known share it follows.
+        """
+        self.text, self.share, now = text, share, time.perf_counter()
+        if share:
+            left = (now - self.began) * (1 - share) / share
+        if left is not None:
+            self._ends = now + left
+
+    def head(self) -> str:
+        """How long it has been, and how long it still takes where that is known."""
+        now = time.perf_counter()
+        said = f"{clock(now - self.began)}  {self.title}"
+        if self._ends is not None and self._ends > now:
+            said += f", about {clock(self._ends - now)} left"
+        return said
+
+    def lines(self, width: int) -> list[str]:
+        """All of it in lines of a width; what is long is wrapped and never cut."""
+        head = textwrap.wrap(self.head(), width)
+        if self.share is not None and len(head[-1]) + _BAR + 2 <= width:
+            done = round(_BAR * min(max(self.share, 0.0), 1.0))
+            head[-1] += f"  {'━' * done}{'╌' * (_BAR - done)}"
+        said = textwrap.wrap(self.text, max(width - 2, 1))
+        return [*head, *(f"  {line}" for line in said)]
+
+    def __rich_console__(self, console: Any, options: Any) -> Iterator[Any]:
+        from rich.text import Text
+
+        # One column less: some terminals go to the next line at the last one.
+        yield Text("\n".join(self.lines(options.max_width - 1)))
+
+
+class Pace:
+    """How long pieces of work of some kinds take, and from that how long the rest will.
+
+    **Arguments:**
+
+    - `course`: kinds of the pieces that are expected, in their order.
+    """
+
+    def __init__(self, course: Sequence[str], now: Callable[[], float] = time.perf_counter) -> None:
+        self._ahead, self._now = list(course), now
+        self._took: dict[str, list[float]] = {}
+        self._at: tuple[str, float] | None = None
+
+    def begin(self, kind: str, then: Sequence[str] | None = None) -> float | None:
+        """Begins a piece, which ends the last one; the time left in s, None where it is not known.
+
+        **Arguments:**
+
+        - `then`: what is expected after it, where that is not what it was.
+        """
+        if self._at is not None:
+            last, began = self._at
+            self._took.setdefault(last, []).append(self._now() - began)
+        self._at = kind, self._now()
+        if then is not None:
+            self._ahead = list(then)
+        elif kind in self._ahead:
+            self._ahead = self._ahead[self._ahead.index(kind) + 1 :]
+        if not self._took:
+            return None
+        return sum(map(self._usual, [kind, *self._ahead]))
+
+    def _usual(self, kind: str) -> float:
+        """The mean of what pieces of a kind took; of a kind that is new, of all pieces."""
+        took = self._took.get(kind) or [x for of in self._took.values() for x in of]
+        return sum(took) / len(took)
 
 
 @contextlib.contextmanager
 def working(title: str, show: bool = True) -> Iterator[Callable[..., None]]:
-    """Gives a function that replaces the line's text; silent where stderr is no terminal.
+    """Gives a function that replaces the text; silent where there is neither terminal nor notebook.
 
-    The function takes the text and, where it is known, the share that is done, 0 to 1. The line
-    shows how long it has been as well.
+    The function takes the text and, where they are known, the share that is done, 0 to 1, and
+    `left`, the time left in s. How long it has been is shown as well.
 
     **Arguments:**
 
@@ -19,6 +116,11 @@ def working(title: str, show: bool = True) -> Iterator[Callable[..., None]]:
     if not show:
         yield silent
         return
+    line = Line(title)
+    handle = notebook_output()
+    if handle is not None:
+        yield from _in_notebook(line, handle)
+        return
     # Here, since most of a short command's life goes into imports.
     from rich.console import Console
 
@@ -26,21 +128,87 @@ def working(title: str, show: bool = True) -> Iterator[Callable[..., None]]:
     if not console.is_terminal:
         yield silent
         return
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.live import Live
 
-    text = TextColumn("{task.description}")
-    columns = (SpinnerColumn(), TimeElapsedColumn(), BarColumn(16), text)
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task(title, total=None)
+    with Live(line, console=console, transient=True, refresh_per_second=_RATE):
+        yield line.say
 
-        def say(text: str, share: float | None = None) -> None:
-            known = None if share is None else 1.0
-            progress.update(task, description=f"{title}: {text}", completed=share or 0.0)
-            # `update` takes None for what is not to change; the bar pulses where the total is None.
-            progress.tasks[0].total = known
 
+def _in_notebook(line: Line, handle: Any) -> Iterator[Callable[..., None]]:
+    shown = 0.0
+
+    def say(text: str, share: float | None = None, left: float | None = None) -> None:
+        nonlocal shown
+        line.say(text, share, left)
+        if time.perf_counter() > shown + 1 / _RATE:
+            shown = time.perf_counter()
+            handle.update(_html(line), raw=True)
+
+    try:
         yield say
+    finally:
+        # What is done needs no line; a display cannot be taken away, only emptied.
+        handle.update({"text/html": "", "text/plain": ""}, raw=True)
 
 
-def silent(text: str, share: float | None = None) -> None:
+def _html(line: Line) -> dict[str, str]:
+    bar = "" if line.share is None else f'<progress value="{line.share:.3f}"></progress> '
+    said = f"{html.escape(line.head())}<br>{bar}{html.escape(line.text)}"
+    style = "font-variant-numeric:tabular-nums;opacity:.8"
+    return {
+        "text/html": f'<div style="{style}">{said}</div>',
+        "text/plain": "\n".join(line.lines(80)),
+    }
+
+
+def live_figure(show: bool = True) -> Callable[[Callable[[], Any]], None]:
+    """Gives a function that draws a figure in a notebook, each in the last one's place.
+
+    It takes what makes the figure, which is not called outside of a notebook.
+
+    **Arguments:**
+
+    - `show`: False to draw nothing anywhere.
+    """
+    handles: list[Any] = []
+
+    def draw(make: Callable[[], Any]) -> None:
+        if not show or not in_notebook():
+            return
+        if not handles:
+            handles.append(notebook_output())
+        content = {"application/vnd.plotly.v1+json": json.loads(make().to_json())}
+        handles[0].update({**content, "text/plain": "a figure"}, raw=True)
+
+    return draw
+
+
+def in_notebook() -> bool:
+    """Whether this process is the kernel of a notebook."""
+    # IPython is imported by nobody but IPython.
+    if "IPython" not in sys.modules:
+        return False
+    from IPython.core.getipython import get_ipython  # type: ignore[import-not-found]
+
+    return hasattr(get_ipython(), "kernel")
+
+
+def notebook_output() -> Any:
+    """A place in a notebook's output that can be filled anew; None outside of a notebook."""
+    if not in_notebook():
+        return None
+    from IPython.display import display  # type: ignore[import-not-found]
+
+    return display({"text/plain": ""}, raw=True, display_id=True)
+
+
+def clock(seconds: float) -> str:
+    """A duration as minutes and seconds, or hours."""
+    whole = round(max(seconds, 0.0))
+    hours, rest = divmod(whole, 3600)
+    minutes, rest = divmod(rest, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def silent(text: str, share: float | None = None, left: float | None = None) -> None:
     """Says nothing."""

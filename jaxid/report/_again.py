@@ -8,8 +8,9 @@ from importlib import metadata
 import numpy as np
 
 from ..discovery import Discovery
+from ..excitation import Limits
 from ..recording import Recording
-from ._html import Content, Markup, details, join, section, table, tag
+from ._html import Content, Markup, details, join, number, section, table, tag
 
 
 def settings(story: Discovery) -> Markup:
@@ -32,14 +33,40 @@ def settings(story: Discovery) -> Markup:
     if held is not None:
         recordings += [["held out", *_recording(r)] for r in held.recordings]
     columns = ["used", "recording", "samples", "duration, s", "rate, Hz", "SHA-256 of its numbers"]
-    whole = tag("pre", json.dumps(_plain(story.to_dict()), indent=1, ensure_ascii=False))
+    told = json.dumps(_plain(story.to_dict()), indent=1, ensure_ascii=False)
+    # It scrolls, and the keyboard reaches what scrolls.
+    whole = tag("pre", told, tabindex="0", role="region", aria_label="the story as JSON")
     said = join("The story as ", tag("code", "jaxid discover --json"), " writes it")
     return section(
         "To do it again",
         table(columns, recordings, "recordings"),
-        table(["setting", "value"], rows, "settings and versions"),
+        details("How far the recordings reach", _reach(story)),
+        details("Settings and versions", table(["setting", "value"], rows, "settings, versions")),
         details(said, whole, class_="raw"),
     )
+
+
+def _reach(story: Discovery) -> Markup:
+    """Ranges of the fitted recordings, beyond which nothing has been seen."""
+    limits = Limits.of(story.fit.recordings)
+    torque, position = story.loop.arm.units()
+    rows: list[list[Content]] = [
+        [
+            f"joint {j + 1}",
+            _range(limits.low[j], limits.high[j], position[j]),
+            f"{limits.speed[j]:.3g}\u00a0{position[j]}/s",
+            f"{limits.acceleration[j]:.3g}\u00a0{position[j]}/s²",
+            f"{limits.torque[j]:.3g}\u00a0{torque[j]}",
+        ]
+        for j in range(len(limits.low))
+    ]
+    columns = ["joint", "position", "speed up to", "acceleration up to", "torque up to"]
+    return table(columns, rows, "ranges of the fitted recordings: beyond them nothing was seen")
+
+
+def _range(low: float, high: float, unit: str) -> str:
+    first, last = (number(float(f"{x:.3g}")) for x in (low, high))
+    return f"{first}\u00a0…\u00a0{last}\u00a0{unit}"
 
 
 def _plain(value: object) -> object:

@@ -1,8 +1,9 @@
-"""The page's head: the verdict, what it did to the error, and what was found."""
+"""The page's head: the verdict, what was asked, and what was found."""
+
+from collections.abc import Sequence
 
 from ..discovery import Discovery
-from ..discovery.story import odds
-from ._html import Markup, number, tag
+from ._html import Markup, join, tag, with_deviation
 
 WORDS = {
     "adequate": "adequate",
@@ -13,47 +14,33 @@ WORDS = {
 
 
 def head(story: Discovery) -> Markup:
-    """The verdict, what it did to the error, and what was found."""
+    """The verdict, what was asked, and what was found."""
     badge = tag("span", WORDS[story.verdict], class_=f"badge {story.verdict}")
     kicker = tag("p", "jaxid discover: ", tag("b", story.loop.name), " ", badge, class_="kicker")
-    notes = [tag("p", note, class_="note") for note in story.notes]
     # A reason is too long for a headline.
     said, _, why = story.sentence.partition(": ") if story.reason else (story.sentence, "", "")
-    pieces = [kicker, tag("h1", f"{said.rstrip('.')}.")]
-    if why:
-        pieces.append(tag("p", f"{why[:1].upper()}{why[1:]}"))
-    pieces.append(tag("p", _lead(story), class_="lead"))
-    return tag("header", *pieces, tag("div", *_cards(story), class_="cards"), _found(story), *notes)
+    reason = tag("p", f"{why[:1].upper()}{why[1:]}") if why else None
+    notes = [tag("p", note, class_="note") for note in story.notes]
+    title = tag("h1", f"{said.rstrip('.')}.")
+    return tag("header", kicker, title, reason, _asked(story), _found(story), *notes)
 
 
-def _judged(story: Discovery) -> tuple[list[str], str]:
-    """The columns by which the story is judged, and what they were taken on."""
-    held = [c for c in story.table().columns if c.startswith("held out")]
-    if held:
-        return held, "recordings that no fit has seen"
-    return list(story.table().columns), "the fitted recordings; none were held out"
-
-
-def _lead(story: Discovery) -> str:
-    _, where = _judged(story)
-    return (
-        "Relative error of the torque (norm of measured less simulated over norm of measured) on "
-        f"{where}, and what noise alone would leave of it:"
+def _asked(story: Discovery) -> Markup:
+    first = story.steps[0]
+    fitted = _listed(first.fit.recordings.names)
+    judged = (
+        "no recording was held out"
+        if first.held_out is None
+        else f"judged on {_listed(first.held_out.recordings.names)}, which no fit has seen"
     )
+    said = f"Asked: which physical effect does this model lack? Fitted to {fitted}; {judged}."
+    return tag("p", said, class_="lead")
 
 
-def _cards(story: Discovery) -> list[Markup]:
-    rows = story.table()
-    cards = []
-    for place, name in enumerate(_judged(story)[0]):
-        first, last = float(rows[name].iloc[0]), float(rows[name].iloc[-1])
-        change = f"{first:.2f} → {last:.2f} %" if len(rows) > 1 else f"{last:.2f} %"
-        floor = f"noise floor {story.noise_floor_percent()[place]:.2f} %"
-        title = name.removeprefix("held out, ")
-        cards.append(
-            tag("div", tag("span", title), tag("b", change), tag("small", floor), class_="card")
-        )
-    return cards
+def _listed(names: Sequence[str]) -> str:
+    if len(names) > 3:
+        return f"{', '.join(names[:2])} and {len(names) - 2} more recordings"
+    return " and ".join(names) if len(names) < 3 else f"{names[0]}, {names[1]} and {names[2]}"
 
 
 def _found(story: Discovery) -> Markup | None:
@@ -64,11 +51,12 @@ def _found(story: Discovery) -> Markup | None:
         assert step.added is not None
         where = "" if entry["joint"] is None else f" on joint {entry['joint']}"
         values = ", ".join(_value(name, **p) for name, p in entry["parameters"].items())
-        sure = f" (probability {odds(step.probability)})"
-        lines.append(tag("li", tag("b", f"{step.added.spoken()}{where}"), f"{sure}: {values}"))
+        name = step.added.spoken()
+        title = tag("b", f"{name[:1].upper()}{name[1:]}{where}")
+        lines.append(tag("li", join(title, f": {values}")))
     return tag("ul", *lines, class_="found") if lines else None
 
 
 def _value(name: str, value: float, std: float | None, unit: str) -> str:
-    deviation = "" if std is None else f" ± {number(float(f'{std:.2g}'))}"
-    return f"{name} {number(value)}{deviation}{'' if unit == '1' else f' {unit}'}"
+    end = "" if unit == "1" else f"\u00a0{unit}"
+    return f"{name}\u00a0{with_deviation(value, std)}{end}"

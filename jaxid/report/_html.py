@@ -3,12 +3,17 @@
 import html
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import plotly.graph_objects as go
 
 
 class Markup(str):
     """Text that is HTML already; every other string is escaped on its way in."""
+
+
+class Cell(Markup):
+    """A cell of a table, with the value by which its column sorts."""
 
 
 Content = str | int | float | None
@@ -48,9 +53,23 @@ def table(
 
 
 def _cell(value: Content) -> Markup:
+    if isinstance(value, Cell):
+        return value
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return tag("td", value if value is not None else "")
-    return tag("td", number(value), class_="number", data_value=repr(float(value)))
+    return cell(number(value), value)
+
+
+def cell(shown: Content, value: float, class_: str = "number") -> Cell:
+    """A number shown in words of one's own, sorted by its value."""
+    return Cell(tag("td", shown, class_=class_, data_value=repr(float(value))))
+
+
+def bar(shown: Content, value: float, share: float) -> Cell:
+    """A number with a bar of a length between 0 and 1 below it."""
+    width = 100 * min(max(share, 0.0), 1.0) if math.isfinite(share) else 0.0
+    drawn = tag("span", class_="bar", style=f"width:{width:.1f}%")
+    return cell(join(shown, drawn), value, "number barred")
 
 
 def number(value: float) -> str:
@@ -58,6 +77,21 @@ def number(value: float) -> str:
     if not math.isfinite(value):
         return "–" if math.isnan(value) else ("∞" if value > 0 else "−∞")
     return f"{value:.4g}".replace("-", "−")
+
+
+def with_deviation(value: float, std: float | None) -> str:
+    """A value and its standard deviation of two digits, to the same place."""
+    if std is None or not math.isfinite(std) or std <= 0:
+        return number(value)
+    digits = 1 - math.floor(math.log10(std))
+    if not 0 <= digits <= 6:
+        return f"{number(value)}\u00a0±\u00a0{number(float(f'{std:.2g}'))}"
+    return f"{value:.{digits}f}\u00a0±\u00a0{std:.{digits}f}".replace("-", "−")
+
+
+def percent(share: float) -> str:
+    """A percentage of three digits."""
+    return f"{share:.{2 if share < 10 else 1 if share < 100 else 0}f}"
 
 
 def probability(p: float) -> str:
@@ -70,36 +104,50 @@ def details(summary: Content, *content: Content, class_: str | None = None) -> M
     return tag("details", tag("summary", summary), *content, class_=class_)
 
 
+def choose(name: str, title: str, labels: Sequence[Content], first: int) -> Markup:
+    """A choice of one of several, each in words; the page's script shows the chosen panel."""
+    options = [
+        tag(
+            "label",
+            Markup(
+                f'<input type="radio" name="{name}" value="{k + 1}"{" checked" * (k == first)}>'
+            ),
+            label,
+            class_="card",
+        )
+        for k, label in enumerate(labels)
+    ]
+    return tag("fieldset", tag("legend", title, class_="unseen"), *options, class_="cards")
+
+
 def link(text: Content, anchor: str) -> Markup:
     """A link to a place on the page."""
     return tag("a", text, href=f"#{anchor}")
 
 
-def figure(
-    drawn: go.Figure, caption: Content, wide: bool = False, linked: str | None = None
-) -> Markup:
-    """A figure with its caption, drawn by the page's script once it comes into sight.
+def figure(drawn: go.Figure, caption: Content, linked: bool = False) -> Markup:
+    """A figure with its caption, drawn by the page's script.
 
     **Arguments:**
 
-    - `wide`: scrolls on a narrow page.
-    - `linked`: figures of the same word share their zoom in time.
+    - `linked`: whether it shares its stretch of time with others, which keys and buttons move.
     """
-    height = int(drawn.layout.height or 400)
+    layout: Any = drawn.layout
+    height = int(layout.height or 400)
+    keys = " Plus and minus zoom, arrows move, 0 shows all."
     box = tag(
         "div",
-        class_="wide" if wide else "plot",
         style=f"height:{height}px",
         data_figure="",
-        data_linked=linked,
+        data_linked="" if linked else None,
         tabindex="0" if linked else None,
-        role="group" if linked else "img",
-        aria_label=f"{caption} Plus and minus zoom, arrows move, 0 resets." if linked else caption,
+        role="group",
+        aria_label=f"{caption}{keys if linked else ''}",
     )
     # Nothing that a figure holds can end the script early.
     data = Markup((drawn.to_json() or "").replace("<", "\\u003c"))
     script = tag("script", data, type="application/json")
-    return tag("figure", tag("div", box, script, class_="scroll"), tag("figcaption", caption))
+    return tag("figure", box, script, tag("figcaption", caption))
 
 
 def section(title: str, *content: Content) -> Markup:

@@ -1,123 +1,60 @@
-"""What to record next, and how far the recordings at hand have reached."""
-
-import numpy as np
+"""What to record next, where that would change the verdict."""
 
 from ..discovery import Discovery, next_experiment
 from ..discovery.diagnosis import Diagnosis, Verdict
+from ..discovery.explore import DECISIVE
+from ..discovery.hypotheses import effect_on
 from ..errors import JaxidError
-from ..excitation import Limits
-from ._html import Content, figure, number, table, tag
+from ._html import Content, Markup, figure, number, section, tag
 
 
-def recommended(story: Discovery) -> list[Content]:
-    """A reference to record, with what it is good for; and the limits of what was seen."""
-    pieces = _experiment(story)
-    pieces += [tag("p", _weakest(story)), _reach(story.diagnosis)]
-    return pieces
-
-
-def _experiment(story: Discovery) -> list[Content]:
-    asked, why = _question(story)
+def ahead(story: Discovery) -> Markup | None:
+    """A reference that tells apart what these recordings cannot; None where nothing is open."""
+    asked = _open_question(story)
     if asked is None:
-        return [tag("p", why)]
-    diagnosis, effects = asked
+        return None
+    return section("What to record next", *_experiment(*asked))
+
+
+def _open_question(story: Discovery) -> tuple[Diagnosis, list[Verdict], str] | None:
+    """Effects that the next recording should tell apart, on which diagnosis, and why."""
+    diagnosis = None
+    for before, step in zip(story.steps, story.steps[1:], strict=False):
+        # A model between two steps may never have been linearised; the one before it was.
+        diagnosis = before.diagnosis or diagnosis
+        if not step.alike or step.added is None or diagnosis is None:
+            continue
+        key = (step.added.effect_name(), getattr(step.added, "joint", None))
+        known = {v.key: v for v in diagnosis.ranking}
+        others = [known[k] for k in step.alike if k in known][:2]
+        if key not in known or not others:
+            continue
+        said = " or ".join(effect_on(v.hypothesis.effect.spoken(), v.key[1]) for v in others)
+        name = effect_on(step.added.spoken(), key[1])
+        why = f"These recordings cannot tell whether the model lacked {name} or {said}."
+        return diagnosis, [known[key], *others], why
+    return None
+
+
+def _experiment(diagnosis: Diagnosis, effects: list[Verdict], why: str) -> list[Content]:
     try:
         proposed = next_experiment(diagnosis, effects)
     except JaxidError as error:
-        return [tag("p", f"No reference can be proposed: {error}.", class_="note")]
+        return [tag("p", f"{why} No reference can be proposed: {error}.", class_="note")]
+    if proposed.then < DECISIVE or proposed.then < proposed.now:
+        # It would leave the verdict as it is.
+        said = f"{why} No reference within the limits reached so far would tell them apart."
+        return [tag("p", said)]
     unit = diagnosis.fit.loop.arm.units()[1]
     drawn = proposed.plot()
     for row, one in enumerate(unit, start=1):
-        drawn.update_yaxes(title_text=f"reference of joint {row} ({one})", row=row, col=1)
-    gain = "more" if proposed.then > 1.1 * proposed.now else "no more"
+        drawn.update_yaxes(title_text=f"joint {row} ({one})", row=row, col=1)
+    drawn.update_layout(showlegend=False)
     caption = (
-        f"A reference of {proposed.recording.duration:.0f} s within the positions, speeds, "
-        f"accelerations and torques reached so far. Whitened squared error: "
-        f"{number(proposed.then)}, where the recordings at hand give {number(proposed.now)}, so it "
-        f"tells {gain} than they do. Ten is decisive."
+        f"Reference of {proposed.recording.duration:.0f} s within the positions, speeds, "
+        "accelerations and torques reached so far. The effects differ on it by "
+        f"{number(proposed.then)} in whitened squared error, on the recordings at hand by "
+        f"{number(proposed.now)}; {DECISIVE:g} is decisive."
     )
-    return [tag("p", why), figure(drawn, caption)]
-
-
-def _question(story: Discovery) -> tuple[tuple[Diagnosis, list[Verdict]] | None, str]:
-    """Which effects the next recording should set apart, on which diagnosis; and why."""
-    for before, step in zip(story.steps, story.steps[1:], strict=False):
-        if not step.alike or step.added is None or before.diagnosis is None:
-            continue
-        key = (step.added.effect_name(), getattr(step.added, "joint", None))
-        known = {v.key: v for v in before.diagnosis.ranking}
-        others = [known[k] for k in step.alike if k in known]
-        if key in known and others:
-            said = " and ".join(v.hypothesis.effect.spoken() for v in others[:2])
-            why = (
-                f"{_upper(step.added.spoken())} and {said} look alike in these recordings. This "
-                "reference sets them apart."
-            )
-            return (before.diagnosis, [known[key], *others[:2]]), why
-    if story.verdict == "outside_catalogue" and story.diagnosis.where:
-        leader = story.diagnosis.where[0]
-        why = (
-            "What is left is no effect of the catalogue. This reference shows most of the "
-            "dependence that was found, so that its form can be read off."
-        )
-        return (story.diagnosis, [leader]), why
-    if len(story.steps) == 1 and story.reason:
-        return None, f"These recordings do not tell: {story.reason}."
-    if len(story.steps) == 1:
-        return None, "Nothing is missing, so there is nothing to tell apart."
-    step = story.steps[-1]
-    # The model before the last effect may never have been linearised.
-    before = next(s for s in story.steps[-2::-1] if s.diagnosis is not None)
-    assert step.added is not None
-    assert before.diagnosis is not None
-    key = (step.added.effect_name(), getattr(step.added, "joint", None))
-    leader = next((v for v in before.diagnosis.ranking if v.key == key), None)
-    if leader is None:
-        return None, "Nothing is left that another recording would have to tell apart."
-    why = (
-        f"Nothing looks like {step.added.spoken()} in these recordings. To see it on a motion it "
-        "was not found on, record this reference: of those tried it shows most of it."
-    )
-    return (before.diagnosis, [leader]), why
-
-
-def _range(low: float, high: float, unit: str) -> str:
-    return f"{number(float(f'{low:.3g}'))} … {number(float(f'{high:.3g}'))} {unit}".replace(
-        " ", "\u00a0"
-    )
-
-
-def _upper(words: str) -> str:
-    return words[:1].upper() + words[1:]
-
-
-def _weakest(story: Discovery) -> str:
-    """Which parameters another recording would do most for."""
-    fit = story.fit
-    known = {
-        name: 100 * std / abs(value)
-        for name, value, std in zip(fit.names, fit.theta.tolist(), fit.std.tolist(), strict=True)
-        if value != 0 and np.isfinite(std) and std > 0.05 * abs(value)
-    }
-    if not known:
-        return "Every parameter that is determined is known to better than 5 %."
-    loose = sorted(known.items(), key=lambda item: -item[1])[:3]
-    named = ", ".join(f"{name} (±{percent:.2g} %)" for name, percent in loose)
-    return f"Least certain: {named}; motion that makes more of them narrows their intervals."
-
-
-def _reach(diagnosis: Diagnosis) -> Content:
-    limits = Limits.of(diagnosis.fit.recordings)
-    torque, position = diagnosis.fit.loop.arm.units()
-    rows = [
-        [
-            f"joint {j + 1}",
-            _range(limits.low[j], limits.high[j], position[j]),
-            f"{limits.speed[j]:.3g} {position[j]}/s",
-            f"{limits.acceleration[j]:.3g} {position[j]}/s²",
-            f"{limits.torque[j]:.3g} {torque[j]}",
-        ]
-        for j in range(len(limits.low))
-    ]
-    columns = ["", "position", "speed up to", "acceleration up to", "torque up to"]
-    return table(columns, rows, "how far the recordings reach: beyond it nothing has been seen")
+    said = f"{why} Record this reference and add it to those that are fitted: it tells them apart."
+    return [tag("p", said), figure(drawn, caption)]

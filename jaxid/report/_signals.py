@@ -1,47 +1,95 @@
-"""Signals beside the model: where it fails, and what it leaves."""
+"""Measured and simulated signals, before and after, of one joint at a time."""
 
 import numpy as np
-import plotly.graph_objects as go
 from jaxtyping import Float
 from scipy.ndimage import uniform_filter1d
 
-from ..discovery import Comparison, Discovery, compare
-from ..discovery.diagnosis import Verdict, coordinate_unit
-from ..discovery.score import whitened
-from ..discovery.story import Step
 from ..display import figures
-from ..effects import Curve
-from ..noise import autocorrelation
-from ._html import Markup, figure
+from ._beside import Beside
+from ._html import Markup, choose, figure, join, percent, section, tag
 
-LAGS = 38
+# Points of a line over all joints of the page: the page is to be small, a joint alone sharp.
+POINTS = 12_000
 # A stretch counts as misfit where its residual is this many times what noise leaves.
 BEYOND = 2.0
+# Share of a recording up to which misfits are marked.
+MARKED = 0.4
 
 
-def compared(step: Step) -> Comparison:
-    """The step's model beside recordings: held-out ones where there are any."""
-    return step.held_out or compare(step.fit, step.fit.recordings)
+def signals(beside: Beside) -> Markup:
+    """Measured and simulated on one axis with the residual below, one figure a joint."""
+    held, k = beside.after, beside.worst
+    seen = "which no fit has seen" if beside.unseen else "which was fitted"
+    many = len(held.recordings)
+    which = f" (of {many} such recordings the one with the largest errors)" if many > 1 else ""
+    when = ", before → after" if beside.several else ""
+    name = held.recordings.names[k]
+    said = f"Relative error of the {held.signal} on {name}, {seen}{which}{when}:"
+    panels = [
+        tag("div", _figure(beside, j), class_="panel", data_panel=str(j + 1))
+        for j in range(held.loop.joints)
+    ]
+    return section("Measured and simulated", tag("p", said), _cards(beside), _zoom(), *panels)
 
 
-def along(story: Discovery, held: Comparison, recording: int, caption: str) -> Markup:
-    """One recording beside the model, with the stretches marked that noise does not explain."""
-    drawn = held.plot(recording)
-    time, measured, simulated = held.judged(recording)
-    noise = noise_level(story)
-    for joint, rest in enumerate((measured - simulated).T):
-        found = misfits(np.asarray(time), rest, float(noise[joint]))
-        figures.mark_misfit(drawn, joint + 1, found, name=f"beyond {BEYOND:g} × noise")
-    name = held.recordings.names[recording]
-    return figure(drawn, caption, wide=True, linked=name)
+def _cards(beside: Beside) -> Markup:
+    """Errors of all joints; where there are several, each shows its figure."""
+    before = beside.before.error_percent.to_numpy()[beside.worst]
+    after, floor = beside.error[beside.worst], beside.floor[beside.worst]
+    rows = []
+    for j in range(len(after)):
+        change = f"{percent(after[j])}\u00a0%"
+        if beside.several:
+            change = f"{percent(before[j])}\u00a0→\u00a0{change}"
+        small = tag("small", f"noise alone\u00a0{percent(floor[j])}\u00a0%")
+        rows.append(join(tag("span", f"joint {j + 1}"), tag("b", change), small))
+    if len(rows) == 1:
+        return tag("div", tag("div", rows[0], class_="card"), class_="cards")
+    return choose("joint", "Joint that is shown", rows, beside.lead)
 
 
-def noise_level(story: Discovery) -> Float[np.ndarray, " joints"]:
-    """Deviation of each joint's noise along the fitted recordings, in the unit of the signal."""
-    fit = story.fit
-    size = np.stack([np.sqrt(np.mean(rest**2, axis=0)) for rest in fit.residuals])
-    share = story.diagnosis.floor / np.maximum(fit.error_percent.to_numpy(), 1e-12)
-    return np.sqrt(np.mean((size * share) ** 2, axis=0))
+def _zoom() -> Markup:
+    keys = (
+        ("+", "+", "zoom in"),
+        ("−", "-", "zoom out"),
+        ("←", "ArrowLeft", "earlier"),
+        ("→", "ArrowRight", "later"),
+        ("all", "0", "show all"),
+    )
+    buttons = [
+        tag("button", sign, type="button", data_key=key, aria_label=said, title=said)
+        for sign, key, said in keys
+    ]
+    return tag("div", *buttons, class_="zoom", role="group", aria_label="zoom in time")
+
+
+def _figure(beside: Beside, joint: int) -> Markup:
+    held, k = beside.after, beside.worst
+    time, measured, after = (x if x.ndim == 1 else x[:, joint] for x in held.shown(k))
+    before = beside.before.shown(k)[2][:, joint] if beside.several else None
+    torque, position = held.loop.arm.units()
+    noise = float(beside.noise(k)[joint])
+    drawn = figures.before_after(
+        time,
+        measured,
+        after,
+        before,
+        BEYOND * noise,
+        name=held.signal,
+        unit=(position if held.signal == "position" else torque)[joint],
+        most=min(figures.MAX_POINTS, POINTS // held.loop.joints),
+    )
+    found = misfits(time, np.nan_to_num(measured - after), noise)
+    # To mark most of a figure would say nothing; the table of what is left has the share.
+    if sum(end - start for start, end in found) < MARKED * (time[-1] - time[0]):
+        figures.mark_misfit(drawn, 1, found, name="beyond noise")
+    models = "before and after the effects were added" if beside.several else "by the model"
+    caption = (
+        f"Joint {joint + 1} along {held.recordings.names[k]}: {held.signal} as measured and as "
+        f"simulated {models}, and below what is left of it. The band holds 95 % of what noise "
+        "alone leaves."
+    )
+    return figure(drawn, caption, linked=True)
 
 
 def misfits(
@@ -64,62 +112,3 @@ def misfits(
         for start, end in edges.reshape(-1, 2)
         if end - start > 2 * half
     ]
-
-
-def against(held: Comparison, where: Verdict, model: str) -> Markup:
-    """The residual against the coordinate it depends on most, with its mean along it."""
-    curve = where.hypothesis.effect
-    assert isinstance(curve, Curve)
-    joint = curve.joint
-    x, y = [], []
-    for k, (run, rest) in enumerate(zip(held.runs, held.residuals, strict=True)):
-        kept = np.isin(np.asarray(run.time), held.judged(k)[0])
-        kind = curve.coordinate
-        way = run.time if kind == "t" else np.asarray(getattr(run, kind))[:, curve.of - 1]
-        sign = np.sign(np.asarray(run.v)[kept, joint - 1]) if curve.signed else 1.0
-        # Where the joint stands still nothing was compared.
-        moves = rest[:, joint - 1] != 0
-        x.append(np.asarray(way)[kept][moves])
-        y.append((rest[:, joint - 1] * sign)[moves])
-    name = curve.spoken_coordinate
-    signed = " × sign of velocity" if curve.signed else ""
-    torque, position = held.loop.arm.units()
-    drawn = figures.dependence(
-        np.concatenate(x),
-        np.concatenate(y),
-        name,
-        coordinate_unit(curve, torque, position),
-        (position if held.signal == "position" else torque)[joint - 1],
-        y_name=f"residual of joint {joint}{signed}",
-    )
-    on = name if curve.coordinate == "t" else f"the {name}"
-    return figure(
-        drawn,
-        f"What {model} leaves of joint {joint}'s {held.signal}{signed}, against {on}. A model that "
-        "lacks nothing leaves a flat line. The line is the mean in stretches of equal count, the "
-        "band two standard errors of independent samples.",
-    )
-
-
-def whiteness(story: Discovery, held: Comparison, recording: int) -> list[Markup]:
-    """Autocorrelation of each joint's residual once the noise filter is taken out of it."""
-    rest = held.residuals[recording]
-    mask = np.ones((1, len(rest)), bool)
-    # The filter has nothing to go by in its first rows, which are zero.
-    start = max(filt.order for filt in story.diagnosis.noise)
-    shown = whitened(rest[None], story.diagnosis.noise, mask)[0, start:]
-    pieces = []
-    for joint, column in enumerate(shown.T, start=1):
-        acf, bound = autocorrelation([column - column.mean()], LAGS)
-        outside = int(np.sum(np.abs(acf[1:]) > bound))
-        order = story.diagnosis.noise[joint - 1].order
-        colour = f"noise coloured by a filter of order {order}" if order else "white noise"
-        caption = (
-            f"Joint {joint} along {held.recordings.names[recording]}, {colour} taken out: "
-            f"{outside} of {LAGS} lags beyond the bound; {0.05 * LAGS:.0f} are expected of what "
-            "is white."
-        )
-        drawn: go.Figure = figures.autocorrelation(np.arange(1, LAGS + 1), acf[1:], bound)
-        drawn.update_layout(height=260)
-        pieces.append(figure(drawn, caption))
-    return pieces

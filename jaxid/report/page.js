@@ -39,9 +39,15 @@ function library() {
 // A figure is drawn once it comes near the window, the others when the browser has nothing to do.
 const root = document.documentElement;
 const boxes = [...document.querySelectorAll("[data-figure]")];
+const linked = boxes.filter((box) => box.dataset.linked !== undefined);
+// A finger that moves over a figure scrolls the page; buttons zoom.
+const coarse = matchMedia("(pointer: coarse)").matches;
 const config = { responsive: true, displaylogo: false, modeBarButtons: [["toImage", "resetScale2d"]] };
 const colour = (name) => getComputedStyle(root).getPropertyValue(name).trim();
 const ink = () => ({ "font.color": colour("--quiet") });
+const visible = (box) => box.offsetParent !== null;
+// The stretch of time that linked figures show; null for all of it.
+let shown = null;
 
 function draw(box) {
   if (box.dataset.drawn !== undefined) return;
@@ -49,29 +55,33 @@ function draw(box) {
   library();
   const { data, layout } = JSON.parse(box.nextElementSibling.textContent);
   layout.font = { ...layout.font, color: colour("--quiet") };
-  Plotly.newPlot(box, data, layout, config);
-  if (box.dataset.linked !== undefined) box.on("plotly_relayout", (change) => follow(box, change));
+  if (coarse) layout.dragmode = false;
+  const bar = coarse || box.dataset.linked !== undefined ? { displayModeBar: false } : {};
+  Plotly.newPlot(box, data, layout, { ...config, ...bar });
+  if (box.dataset.linked === undefined) return;
+  show(box);
+  box.on("plotly_relayout", follow);
 }
 
 // Figures of one recording show the same stretch of time.
-function follow(box, change) {
+function follow(change) {
   const range = change["xaxis.range"] ?? [change["xaxis.range[0]"], change["xaxis.range[1]"]];
-  const whole = change["xaxis.autorange"];
-  if (range[0] === undefined && !whole) return;
-  for (const other of boxes) {
-    if (other === box || other.dataset.linked !== box.dataset.linked) continue;
-    draw(other);
-    const now = other.layout.xaxis;
-    if (whole ? now.autorange : !now.autorange && now.range[0] === range[0] && now.range[1] === range[1])
-      continue;
-    Plotly.relayout(other, whole ? { "xaxis.autorange": true } : { "xaxis.range": [...range] });
-  }
+  if (change["xaxis.autorange"]) shown = null;
+  else if (range[0] !== undefined) shown = [...range];
+  else return;
+  for (const box of linked) if (visible(box)) show(box);
 }
 
-// Plus and minus zoom in time, arrows move, 0 shows all.
-function key(event) {
-  const box = event.currentTarget;
-  if (event.ctrlKey || event.metaKey || event.altKey || box.layout === undefined) return;
+function show(box) {
+  const now = box.layout?.xaxis;
+  if (now === undefined) return;
+  if (shown ? !now.autorange && now.range[0] === shown[0] && now.range[1] === shown[1] : now.autorange)
+    return;
+  Plotly.relayout(box, shown ? { "xaxis.range": [...shown] } : { "xaxis.autorange": true });
+}
+
+// Plus and minus zoom in time, arrows move, 0 shows all; by the keyboard and by buttons.
+function move(box, name) {
   const [low, high] = box.layout.xaxis.range;
   const middle = (low + high) / 2;
   const half = (high - low) / 2;
@@ -81,11 +91,49 @@ function key(event) {
     "-": [middle - half * 1.5, middle + half * 1.5],
     ArrowLeft: [low - half / 4, high - half / 4],
     ArrowRight: [low + half / 4, high + half / 4],
-  }[event.key];
-  if (to === undefined && event.key !== "0") return;
-  event.preventDefault();
+  }[name];
+  if (to === undefined && name !== "0") return false;
   Plotly.relayout(box, to === undefined ? { "xaxis.autorange": true } : { "xaxis.range": to });
+  return true;
 }
+for (const box of linked)
+  box.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || box.layout === undefined) return;
+    if (move(box, event.key)) event.preventDefault();
+  });
+for (const button of document.querySelectorAll("[data-key]"))
+  button.addEventListener("click", () => {
+    const box = linked.find(visible);
+    if (box === undefined) return;
+    draw(box);
+    move(box, button.dataset.key);
+  });
+
+// One joint's panel at a time; without this script all of them are there.
+const panels = [...document.querySelectorAll("[data-panel]")];
+const choices = [...document.querySelectorAll("input[name=joint]")];
+function choose() {
+  const chosen = choices.find((choice) => choice.checked);
+  if (chosen === undefined) return;
+  for (const panel of panels) panel.hidden = panel.dataset.panel !== chosen.value;
+  refresh();
+}
+for (const choice of choices) choice.addEventListener("change", choose);
+
+// What has come to be shown is drawn, at the width and the stretch of time of now.
+function refresh() {
+  if (!ready) return;
+  for (const box of boxes) {
+    if (!visible(box)) continue;
+    if (box.layout === undefined) {
+      if (box.closest("[data-panel], details")) draw(box);
+      continue;
+    }
+    Plotly.Plots.resize(box);
+    if (box.dataset.linked !== undefined) show(box);
+  }
+}
+for (const one of document.querySelectorAll("details")) one.addEventListener("toggle", refresh);
 
 const seen = new IntersectionObserver(
   (entries) => {
@@ -93,18 +141,19 @@ const seen = new IntersectionObserver(
   },
   { rootMargin: "300px" },
 );
-for (const box of boxes)
-  if (box.dataset.linked !== undefined) box.addEventListener("keydown", key);
 const idle = window.requestIdleCallback ?? ((call) => setTimeout(call, 50));
 function drawOne() {
-  const box = boxes.find((one) => one.dataset.drawn === undefined);
+  const box = boxes.find((one) => one.dataset.drawn === undefined && visible(one));
   if (box === undefined) return;
   draw(box);
   idle(drawOne);
 }
 // Not before the page has loaded and been shown: text, tables and links need no figure.
+let ready = false;
+choose();
 addEventListener("load", () =>
   idle(() => {
+    ready = true;
     for (const box of boxes) seen.observe(box);
     idle(drawOne);
   }),
@@ -117,10 +166,12 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
 // Figures are drawn for the window; paper is narrower, white, and shows what is folded away.
 const folded = document.querySelectorAll("details:not(.raw)");
 addEventListener("beforeprint", () => {
+  for (const panel of panels) panel.hidden = false;
+  for (const one of folded) one.open = true;
   for (const box of boxes) draw(box);
   for (const box of drawn()) Plotly.relayout(box, { width: 680, "font.color": "#444" });
-  for (const one of folded) one.open = true;
 });
 addEventListener("afterprint", () => {
+  choose();
   for (const box of drawn()) Plotly.relayout(box, { autosize: true, width: null, ...ink() });
 });

@@ -5,11 +5,13 @@ page and on a dark one; what differs in colour also differs in width, dash, mark
 it reads in grey as well.
 """
 
+from .along_time import before_after as before_after
 from .along_time import comparison as comparison
 from .along_time import mark_misfit as mark_misfit
 from .along_time import shares_in_time as shares_in_time
 from .along_time import signals as signals
 from .estimates import deviance as deviance
+from .estimates import differences as differences
 from .estimates import parameters as parameters
 from .estimates import ranking as ranking
 from .look import BLUE as BLUE

@@ -8,8 +8,27 @@ import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
 
-from .look import DASHES, MISFIT, PALETTE, finish, with_unit
-from .panels import MAX_GAPS, Trace, add_acf, add_panel, broken_at_gaps, decimated, shade_gaps
+from .look import (
+    BLUE,
+    DASHES,
+    MISFIT,
+    ORANGE,
+    PALETTE,
+    SHADE,
+    finish,
+    with_unit,
+)
+from .panels import (
+    MAX_GAPS,
+    MAX_POINTS,
+    ROLE_LINES,
+    Trace,
+    add_acf,
+    add_panel,
+    broken_at_gaps,
+    decimated,
+    shade_gaps,
+)
 
 
 def signals(
@@ -96,6 +115,58 @@ def comparison(
     last: dict[str, Any] = {"row": 2 * joints - 1, "col": 2}
     figure.update_xaxes(title_text="lag (samples)", showticklabels=True, **last)
     return finish(figure, title, height=140 + 290 * joints, legend=True)
+
+
+def before_after(
+    time: Float[np.ndarray, " samples"],
+    measured: Float[np.ndarray, " samples"],
+    simulated: Float[np.ndarray, " samples"],
+    before: Float[np.ndarray, " samples"] | None,
+    band: float,
+    *,
+    name: str = "torque",
+    unit: str = "N·m",
+    most: int = MAX_POINTS,
+    title: str | None = None,
+) -> go.Figure:
+    """Draw a measured signal with what one model or two simulate, and below what they leave of it.
+
+    Arguments:
+        time: Sampling times in s, shape `(samples,)`.
+        measured: In `unit`, shape `(samples,)`.
+        simulated: By the model at the end, in `unit`, shape `(samples,)`.
+        before: By the model at the start, where there is one, in `unit`, shape `(samples,)`.
+        band: Half-width in `unit` of the band in which noise alone would lie.
+        name: What is drawn.
+        unit: As printed.
+        most: How many points a line has at the most.
+        title: Of the whole figure.
+    """
+    figure = go.Figure().set_subplots(
+        rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[1.0, 0.7]
+    )
+    # Each line is thinner than the one below it, so that all of them are seen where they agree.
+    lines = [("measured", measured, ROLE_LINES["measured"]["color"], 4.5)]
+    if before is not None:
+        lines.append(("before", before, ORANGE, 2.2))
+    lines.append(("simulated" if before is None else "after", simulated, BLUE, 1.3))
+    for label, signal, colour, width in lines:
+        style: dict[str, Any] = {"line": {"color": colour, "width": width}, "mode": "lines"}
+        x, y = decimated(*broken_at_gaps(time, signal), most)
+        figure.add_scatter(x=x, y=y, name=label, legendgroup=label, row=1, col=1, **style)
+        if signal is not measured:
+            x, y = decimated(*broken_at_gaps(time, measured - signal), most)
+            style |= {"name": label, "legendgroup": label, "showlegend": False}
+            figure.add_scatter(x=x, y=y, row=2, col=1, **style)
+    edges: dict[str, Any] = {"line": {"width": 0}, "layer": "below", "row": 2, "col": 1}
+    figure.add_hrect(y0=-band, y1=band, fillcolor=SHADE, **edges)
+    square = {"symbol": "square", "size": 12, "color": SHADE}
+    figure.add_scatter(x=[None], y=[None], name="noise", mode="markers", marker=square)
+    shade_gaps(figure, time, [Trace(name, measured, unit)], "not compared")
+    figure.update_yaxes(title_text=with_unit(name, unit), row=1, col=1)
+    figure.update_yaxes(title_text=with_unit("residual", unit), row=2, col=1)
+    figure.update_xaxes(title_text="time (s)", row=2, col=1)
+    return finish(figure, title, height=400, legend=True)
 
 
 def mark_misfit(

@@ -91,6 +91,43 @@ def deviance(
     return finish(figure, title, height=360, legend=True)
 
 
+def differences(
+    labels: Sequence[str],
+    values: Float[np.ndarray, " rows"],
+    half: Float[np.ndarray, " rows"],
+    *,
+    x_name: str,
+    x_unit: str,
+    title: str | None = None,
+) -> go.Figure:
+    """Draw differences with their intervals, one row each, and a line at no difference.
+
+    Arguments:
+        labels: One for each row.
+        values: Differences in `x_unit`, shape `(rows,)`.
+        half: Half-widths of their intervals in `x_unit`, shape `(rows,)`.
+        x_name: What the differences are of.
+        x_unit: Unit, as printed.
+        title: Of the whole figure.
+    """
+    figure = go.Figure()
+    place = np.arange(len(labels), dtype=float)
+    figure.add_scatter(
+        x=values,
+        y=place,
+        name="difference, 95 % interval",
+        mode="markers",
+        marker={"color": BLUE, "size": 9},
+        error_x={"array": half, "color": BLUE, "thickness": 2, "width": 5},
+    )
+    figure.add_vline(x=0, line={"color": INK, "dash": "dot"})
+    figure.update_yaxes(
+        tickvals=place, ticktext=list(labels), range=[len(labels) - 0.4, -0.6], zeroline=False
+    )
+    figure.update_xaxes(title_text=with_unit(x_name, x_unit))
+    return finish(figure, title, height=140 + 34 * len(labels), legend=True)
+
+
 def ranking(
     labels: Sequence[str],
     explained: Float[np.ndarray, " candidates"],

@@ -141,11 +141,13 @@ def broken_at_gaps(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np
     return np.insert(time, after, time[after]), np.insert(values, after, np.nan, axis=0)
 
 
-def decimated(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def decimated(
+    x: np.ndarray, y: np.ndarray, most: int = MAX_POINTS
+) -> tuple[np.ndarray, np.ndarray]:
     """Keep of a long series the least, the greatest and a missing value of each stretch."""
-    if len(y) <= MAX_POINTS:
+    if len(y) <= most:
         return small(x), small(y)
-    width = -(-len(y) // (MAX_POINTS // 3))
+    width = -(-len(y) // (most // 3))
     filled = np.append(y, np.full(-len(y) % width, np.nan)).reshape(-1, width)
     hole = np.isnan(filled)
     kept = [

@@ -8,7 +8,18 @@ import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
 
-from .look import DASHES, MARKERS, PALETTE, PATTERNS, bar, finish, floor_line, with_unit
+from .look import (
+    DASHES,
+    INK,
+    MARKERS,
+    MAX_LEGEND,
+    PALETTE,
+    PATTERNS,
+    bar,
+    finish,
+    floor_line,
+    with_unit,
+)
 
 
 def error_bars(
@@ -71,6 +82,8 @@ def error_falling(
     place = np.arange(len(steps), dtype=float)
     joints = max((values.shape[1] for values in series.values()), default=0)
     names = joint_names or [f"joint {joint + 1}" for joint in range(joints)]
+    # A legend of each joint with each kind of recording would be taller than the figure.
+    short = joints * (len(series) + 1) > MAX_LEGEND
     for joint, (name, colour, marker) in enumerate(zip(names, cycle(PALETTE), cycle(MARKERS))):
         for (kind, values), dash in zip(series.items(), cycle(DASHES)):
             open_marker = marker if dash == "solid" else f"{marker}-open"
@@ -81,17 +94,36 @@ def error_falling(
                 mode="lines+markers",
                 line={"color": colour, "dash": dash, "width": 2},
                 marker={"symbol": open_marker, "size": 9},
+                showlegend=not short,
             )
         if floor is not None:
             line = floor_line(f"{name}, noise floor", colour)
-            figure.add_scatter(x=place[[0, -1]], y=np.full(2, floor[joint]), **line)
+            figure.add_scatter(
+                x=place[[0, -1]], y=np.full(2, floor[joint]), showlegend=not short, **line
+            )
+    if short:
+        _short_legend(figure, names, [*series, *(["noise floor"] if floor is not None else [])])
     figure.update_xaxes(
         title_text="step",
         tickvals=place,
-        ticktext=["<br>".join(wrap(step, 16)) for step in steps],
+        # A name of an effect is one word in tables; it is too long for one line here.
+        ticktext=[
+            "<br>".join(wrap(step.replace("_", " "), 16, break_long_words=False)) for step in steps
+        ],
         range=[-0.35, len(steps) - 0.65],
         showgrid=False,
         zeroline=False,
     )
     figure.update_yaxes(title_text=with_unit("relative error", "%"), rangemode="tozero")
     return finish(figure, title, height=430, legend=True)
+
+
+def _short_legend(figure: go.Figure, names: Sequence[str], kinds: Sequence[str]) -> None:
+    """Name colours and markers once, and dashes once."""
+    for name, colour, marker in zip(names, cycle(PALETTE), cycle(MARKERS)):
+        look = {"color": colour, "symbol": marker, "size": 9}
+        figure.add_scatter(x=[None], y=[None], name=name, mode="markers", marker=look)
+    dashes = dict(zip(kinds, cycle(DASHES))) | {"noise floor": "dot"}
+    for kind in kinds:
+        line = {"color": INK, "dash": dashes[kind], "width": 2}
+        figure.add_scatter(x=[None], y=[None], name=kind, mode="lines", line=line)

@@ -66,7 +66,8 @@ def curve_fit(
     few = np.sort(np.random.default_rng(0).permutation(len(x))[:MAX_DOTS])
     name = y_name if len(few) == len(x) else f"{y_name} ({len(few)} of {len(x)} samples)"
     dots = {"color": INK, "size": 3.5, "opacity": 0.6}
-    figure.add_scatter(x=small(x[few]), y=small(y[few]), name=name, mode="markers", marker=dots)
+    if len(x):
+        figure.add_scatter(x=small(x[few]), y=small(y[few]), name=name, mode="markers", marker=dots)
     if band is not None:
         figure.add_trace(band_trace("confidence band", curve_x, curve - band, curve + band))
     line = {"color": BLUE, "width": 2.6}

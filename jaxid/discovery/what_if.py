@@ -1,0 +1,254 @@
+"""What a fitted model would say with an effect in it, at values that a person moves by hand.
+
+The answer is the linear system's (`linear.py`, `predict.py`), in milliseconds: no model with the
+effect in it is compiled or simulated.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..effects import AbstractEffect
+from ..effects import catalogue as known
+from ..estimate import Fit
+from ..estimate.oem import oem_of
+from ..parameters import Bounds, read_values, write_values
+from ..recording import Recording, Recordings
+from .comparison import Comparison, compare
+from .diagnosis import over_recordings, share_left
+from .hypotheses import amplitudes, free_of
+from .landscape import form
+from .likelihood import score_of
+from .linear import at_rows
+from .predict import Prediction, Predictor, least_squares
+from .score import spanned
+from .screening import offered
+from .system import System
+from .verify import Refits
+
+# Amplitudes of this many times what least squares asks for are as large as anyone would try.
+_WIDE = 3.0
+
+
+class Seen(eqx.Module):
+    """Signals of some recordings as they are compared; zero where there is no sample.
+
+    - `time`: s. `measured`, `simulated`: N·m or N (rad or m in an open loop), the model's own.
+    - `there`: which rows are samples that are compared.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    time: Float[np.ndarray, "recordings rows"]
+    measured: Float[np.ndarray, "recordings rows outputs"]
+    simulated: Float[np.ndarray, "recordings rows outputs"]
+    there: Bool[np.ndarray, "recordings rows"]
+
+
+class Answer(eqx.Module):
+    """What a model would leave with an effect in it.
+
+    - `fitted`, `held_out`: measured less predicted, as in `Seen`; None without such recordings.
+    - `fitted_percent`, `held_out_percent`: relative errors by joint, %.
+    - `possible`: whether no amplitude is beyond its bounds, and the loop does not run away.
+    """
+
+    effect: AbstractEffect | None
+    fitted: Float[np.ndarray, "recordings rows outputs"]
+    fitted_percent: Float[np.ndarray, " outputs"]
+    held_out: Float[np.ndarray, "recordings rows outputs"] | None
+    held_out_percent: Float[np.ndarray, " outputs"] | None
+    possible: bool
+
+
+class WhatIf(eqx.Module):
+    """A fitted model along its recordings and along others, ready for effects to be tried.
+
+    - `settings`: the catalogue's effects that can be asked of the model, at each of their settings.
+    """
+
+    fit: Fit
+    comparison: Comparison | None
+    predictor: Predictor
+    unseen: Predictor | None
+    settings: tuple[AbstractEffect, ...]
+
+    @classmethod
+    def of(
+        cls,
+        fit: Fit,
+        validate: Recording | Recordings | Iterable[Recording] | None = None,
+        catalogue: Sequence[Any] = known,
+    ) -> "WhatIf":
+        """Linearises a fitted model along its recordings, and along those that it has not seen.
+
+        **Arguments:**
+
+        - `fit`: of a loop that can be simulated. `validate`: held out of the fit.
+        - `catalogue`: as for `diagnose`.
+
+        **Raises:** `FitError` where the fitted loop cannot be simulated.
+        """
+        given = fit.noise if isinstance(fit.noise, tuple) else ()
+        system = System.of(fit)
+        noise = given if len(given) == system.residual.shape[2] else score_of(fit).noise
+        _, proposed = offered(system, fit.recordings, catalogue)
+        comparison = None if validate is None else compare(fit, validate)
+        unseen = None if comparison is None else Predictor.of(System.of(comparison), noise)
+        settings = tuple(effect for effect, _ in proposed)
+        return cls(fit, comparison, Predictor.of(system, noise), unseen, settings)
+
+    def seen(self, held_out: bool = False) -> Seen:
+        """The signals of the fitted recordings, or of those held out."""
+        predictor = self.unseen if held_out else self.predictor
+        of = self.comparison if held_out else self.fit
+        assert predictor is not None
+        assert of is not None
+        system, batch = predictor.system, predictor.system.batch
+        signal = batch.tau if system.row == 0 else batch.q
+        measured = np.asarray(signal) * np.asarray(batch.mask)[..., None]
+        measured = np.asarray(batch.compared(measured)) * system.mask[..., None]
+        time = np.asarray(at_rows(batch, system.linear.motion.t))
+        names = tuple(of.recordings.names)
+        if len(names) != len(time):
+            names = tuple(f"window {k}" for k in range(1, len(time) + 1))
+        return Seen(names, time, measured, measured - system.residual, system.mask)
+
+    def answer(self, effect: AbstractEffect | None, again: bool = True) -> Answer:
+        """What the model with an effect at these values leaves of its recordings.
+
+        **Arguments:**
+
+        - `effect`: not in the loop yet; None for the model as it was fitted.
+        - `again`: whether the model's own parameters are estimated again beside the effect, as a
+          refit would; else they stay as they were fitted.
+        """
+        rest, there = _left(self.predictor, effect)
+        taken = np.zeros(self.predictor.base.shape[1])
+        if again and effect is not None:
+            taken = self.predictor.absorbed(rest)
+            rest = _without(self.predictor, rest, taken)
+        percent = _percent(self.fit, self.predictor, rest)
+        if self.unseen is None or self.comparison is None:
+            return Answer(effect, rest, percent, None, None, there)
+        beyond, everywhere = _left(self.unseen, effect)
+        if again and effect is not None:
+            own = taken[: len(self.predictor.system.loop.theta)]
+            beyond = _beyond(self.unseen, beyond, own)
+        unseen_percent = _percent(self.comparison, self.unseen, beyond)
+        return Answer(effect, rest, percent, beyond, unseen_percent, there and everywhere)
+
+    def best(self, like: AbstractEffect) -> AbstractEffect:
+        """An effect at the values of the least squared error, refined from each of its settings.
+
+        **Arguments:**
+
+        - `like`: any of them.
+        """
+        found: list[Prediction] = [
+            self.predictor.predict((self.sized(e),)) for e in self.settings_of(like)
+        ]
+        possible = [p for p in found if p.possible] or found
+        return min(possible, key=lambda p: p.loss).effects[0]
+
+    def settings_of(self, like: AbstractEffect) -> tuple[AbstractEffect, ...]:
+        """The settings of one effect on one joint."""
+        return tuple(e for e in self.settings if form(e) == form(like))
+
+    def sized(self, effect: AbstractEffect) -> AbstractEffect:
+        """The effect at the amplitudes that least squares gives them, inside their bounds."""
+        linear = amplitudes(effect)
+        if not linear:
+            return effect
+        predictor = self.predictor
+        columns = predictor.shown(effect)[..., 1:]
+        names = [n for p in free_of(effect) for n in p.names]
+        at = [names.index(n) for p in linear for n in p.names]
+        white = predictor.data.white(columns[..., at], predictor.noise).reshape(-1, len(at))
+        left = predictor.data.white(predictor.data.residual, predictor.noise).reshape(-1)
+        white = white - predictor.basis @ (predictor.basis.T @ white)
+        basis = spanned(white)
+        bounds = Bounds.of(linear)
+        limits = np.asarray(bounds.lower), np.asarray(bounds.upper)
+        values, _ = least_squares(basis.T @ left, basis.T @ white, limits)
+        return write_values(effect, linear, jnp.asarray(values))
+
+    def ranges(self, like: AbstractEffect) -> dict[str, tuple[float, float]]:
+        """From where to where each free parameter of an effect is worth moving.
+
+        Shapes cover the settings that a diagnosis screens, and half as much on either side.
+        Amplitudes cover three times what least squares asks for.
+        """
+        settings = self.settings_of(like)
+        middle = settings[len(settings) // 2]
+        columns = self.predictor.shown(middle)[..., 1:]
+        size = np.linalg.norm(columns.reshape(-1, columns.shape[-1]), axis=0)
+        # What would be as large as all of the residual, and what least squares asks for.
+        whole = np.linalg.norm(self.predictor.data.residual) / np.maximum(size, 1e-300)
+        sized = self.sized(middle)
+        taken = np.abs(np.asarray(read_values(sized, free_of(sized)))) if len(whole) else whole
+        asked = np.maximum(_WIDE * taken, whole / _WIDE)
+        found, at = {}, 0
+        for p in free_of(settings[0]):
+            values = np.array([read_values(e, [p]) for e in settings])
+            for k, label in enumerate(p.names):
+                low, high = float(values[:, k].min()), float(values[:, k].max())
+                d = p.declaration
+                if d.linear and not settings[0].finite:
+                    low, high = -float(asked[at]), float(asked[at])
+                elif low > 0:
+                    low, high = low / 2, 2 * high
+                else:
+                    reach = 0.5 * (high - low) or d.scale
+                    low, high = low - reach, high + reach
+                found[label] = max(low, d.lower), min(high, d.upper)
+                at += 1
+        return found
+
+    def refit(self, effect: AbstractEffect) -> Fit:
+        """The model with the effect, fitted in full from these values.
+
+        **Raises:** `FitError`, `ModelError` where it cannot be.
+        """
+        refits = Refits(self.fit.recordings, oem_of(self.fit))
+        return refits.with_effects(self.fit, [effect], self.predictor.noise)
+
+
+def _left(predictor: Predictor, effect: AbstractEffect | None) -> tuple[np.ndarray, bool]:
+    """What is left beside an effect, and whether the loop does not run away with it."""
+    residual = predictor.data.residual
+    if effect is None:
+        return residual, True
+    rest = residual - predictor.change(effect)
+    there = bool(np.isfinite(rest).all())
+    return (rest if there else residual) * predictor.data.mask[..., None], there
+
+
+def _without(predictor: Predictor, rest: np.ndarray, taken: np.ndarray) -> np.ndarray:
+    """What is left where the base's values are moved."""
+    return (rest - predictor.data.base @ taken) * predictor.data.mask[..., None]
+
+
+def _beyond(unseen: Predictor, rest: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """What is left of held-out recordings where the loop's own parameters are moved.
+
+    Initial states, which stand behind these in the base, are those that the recordings ask for.
+    """
+    data = unseen.data
+    rest = _without(unseen, rest, np.append(own, np.zeros(data.base.shape[-1] - len(own))))
+    starts = data.base[..., len(own) :]
+    if not starts.shape[-1]:
+        return rest
+    white = data.white(starts, unseen.noise).reshape(-1, starts.shape[-1])
+    left = data.white(rest, unseen.noise).reshape(-1)
+    return rest - starts @ np.linalg.lstsq(white, left, rcond=1e-9)[0]
+
+
+def _percent(
+    of: Fit | Comparison, predictor: Predictor, rest: np.ndarray
+) -> Float[np.ndarray, " outputs"]:
+    share = share_left(of, predictor.data, rest)
+    return over_recordings(of.error_percent.to_numpy() * share)

@@ -1,0 +1,172 @@
+"""The models that were looked at, and what the catalogue's effects would have explained."""
+
+import numpy as np
+
+from ..discovery import Discovery
+from ..discovery.diagnosis import Diagnosis, Verdict
+from ..discovery.hypotheses import effect_on
+from ..discovery.story import Step, odds, step_name
+from ._html import Content, Markup, bar, cell, details, probability, section, table, tag
+
+SHOWN = 12
+
+
+def models(story: Discovery) -> Markup:
+    """The models with their weights, and why each effect was chosen over its rivals."""
+    pieces: list[Content] = []
+    if story.considered:
+        pieces.append(_weights(story))
+    for before, step in zip(story.steps, story.steps[1:], strict=False):
+        pieces += [tag("h3", step.label), tag("p", _reason(before.diagnosis, step))]
+        pieces.append(_alike(step))
+    for name, joint in story.removed:
+        said = f"{effect_on(name, joint)} was added and later found not to be needed."
+        pieces.append(tag("p", said))
+    for step in story.steps:
+        if step.diagnosis is not None:
+            pieces.append(_screened(step.diagnosis, step))
+    return section("Models that were compared", *pieces)
+
+
+def _weights(story: Discovery) -> Markup:
+    best = story.considered[0].score
+    rows = [
+        [
+            m.label,
+            bar(odds(m.weight), m.weight, m.weight),
+            cell(f"{m.score - best:.1f}", m.score - best),
+            _percent(m.left),
+            _percent(m.unseen_percent),
+            m.status,
+        ]
+        for m in story.considered[:SHOWN]
+    ]
+    said = (
+        "The weight is the probability of a model among all that were looked at. It follows from "
+        "the score: exp(-score/2), divided by the sum over all models. Held-out recordings do not "
+        "enter it. A difference of ten in score is decisive."
+    )
+    columns = ["model", "weight", "behind the best", "fitted, %", "held out, %", "fit"]
+    more = len(story.considered) - SHOWN
+    which = "all of them" if more <= 0 else f"the best {SHOWN} of {len(story.considered)}"
+    shown = table(columns, rows, f"models by weight ({which}); errors in % by joint")
+    return Markup(tag("p", said) + shown)
+
+
+def _percent(errors: np.ndarray | None) -> str:
+    # A line breaks between joints, not within a number.
+    return "" if errors is None else ", ".join(f"{x:.2f}" for x in errors)
+
+
+def _reason(diagnosis: Diagnosis | None, step: Step) -> str:
+    """The choice in words: what the effect explains, and how far behind the next one is."""
+    if diagnosis is None or step.added is None:
+        return "It was added together with the effect before it."
+    key = (step.added.effect_name(), getattr(step.added, "joint", None))
+    ranked = [v for v in diagnosis.ranking if v.possible]
+    chosen = next((v for v in ranked if v.key == key), None)
+    others = [v for v in ranked if v.key != key]
+    if chosen is None or not others:
+        return "It was chosen by its refit."
+    rival = others[0]
+    said = (
+        f"{_upper(effect_on(chosen.hypothesis.effect.spoken(), key[1]))} explains "
+        f"{_share(diagnosis, chosen)} of what the model before it left (whitened), noise "
+        f"{100 * diagnosis.gram.count / diagnosis.gram.rest:.3g} %. The best other effect is "
+        f"{effect_on(rival.hypothesis.effect.spoken(), rival.hypothesis.joint)} with "
+        f"{_share(diagnosis, rival)}; what the two do to the torque correlates by "
+        f"{abs(diagnosis.correlation(chosen, rival)):.2f}."
+    )
+    if chosen.evidence > rival.evidence:
+        return said
+    return f"{said} That one was ahead before both were fitted, and behind after it."
+
+
+def _upper(words: str) -> str:
+    return words[:1].upper() + words[1:]
+
+
+def _share(diagnosis: Diagnosis, verdict: Verdict) -> str:
+    return f"{100 * verdict.explained / diagnosis.gram.rest:.3g} %" if diagnosis.gram.rest else "0"
+
+
+def _alike(step: Step) -> Markup:
+    if step.alike:
+        others = ", ".join(effect_on(n, j) for n, j in step.alike)
+        return tag("p", f"These recordings cannot tell it from {others}.", class_="note")
+    return tag("p", "No other effect of the catalogue describes these recordings as well.")
+
+
+def _screened(diagnosis: Diagnosis, step: Step) -> Markup:
+    """What each effect of the catalogue would explain beyond a step's model."""
+    leader = diagnosis.ranking[0] if diagnosis.ranking else None
+    top = diagnosis.ranking[:15]
+    told = diagnosis.table().head(len(top)).to_dict("records")
+    rows = [
+        [
+            r["effect"],
+            r["joint"],
+            bar(f"{share:.3g}", share, share / 100),
+            r["evidence"],
+            cell(probability(r["p_value"]), r["p_value"]),
+            _unbroken(r["amplitude"]),
+            r["predicted_error_percent"],
+            float(f"{abs(diagnosis.correlation(leader, v)):.2f}") if leader else None,
+            "" if r["possible"] else "unphysical",
+        ]
+        for v, r in zip(top, told, strict=True)
+        for share in (r["explained_percent"],)
+    ]
+    columns = [
+        "effect",
+        "joint",
+        "residual explained, %",
+        "evidence",
+        "corrected p",
+        "predicted amplitude",
+        "predicted error, %",
+        "likeness",
+        "note",
+    ]
+    said = (
+        "Every effect of the catalogue at its best setting, predicted from one fit. p-values are "
+        f"corrected for {diagnosis.tests:.0f} independent tests; below {diagnosis.significance:g} "
+        "something counts as missing. Evidence is the whitened squared error that an effect takes "
+        "away, less log(samples) for each amplitude. Likeness is the correlation with what the "
+        "first effect of the list does to the torque."
+    )
+    title = "What each effect would explain beyond " + (
+        "the starting model" if step.added is None else f"the model with {step_name(step)}"
+    )
+    return details(title, tag("p", said), table(columns, rows, title))
+
+
+def _unbroken(amplitudes: str) -> str:
+    """Amplitudes that a line breaks between, not within."""
+    return ", ".join(one.replace(" ", "\u00a0") for one in amplitudes.split(", "))
+
+
+def where_table(diagnosis: Diagnosis) -> Markup:
+    """Free-form curves: on what the torque of which joint depends beyond the model."""
+    rows = []
+    shares = diagnosis.where_table()["explained_percent"]
+    for verdict, share in list(zip(diagnosis.where, shares, strict=True))[:10]:
+        curve = verdict.hypothesis.effect
+        rows.append(
+            [
+                f"joint {verdict.hypothesis.joint}",
+                curve.spoken_coordinate,  # type: ignore[attr-defined]
+                "yes" if curve.signed else "",  # type: ignore[attr-defined]
+                cell(probability(verdict.p_value), verdict.p_value),
+                bar(f"{float(share):.3g}", float(share), float(share) / 100),
+            ]
+        )
+    columns = [
+        "torque of",
+        "depends on",
+        "and on direction",
+        "corrected p",
+        "residual explained, %",
+    ]
+    caption = "free-form curves: on what the torque of which joint depends beyond the final model"
+    return details("On what else it might depend", table(columns, rows, caption))
