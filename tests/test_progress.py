@@ -2,10 +2,11 @@
 
 import io
 
+import numpy as np
 import pytest
 from rich.console import Console
 
-from jaxid.display import progress
+from jaxid.display import figures, progress
 from jaxid.display.progress import Line, Pace, clock
 
 LONG = "fit with " + " and ".join(f"position_dependent_friction on joint {k}" for k in range(1, 7))
@@ -87,13 +88,11 @@ def test_figures_are_made_for_notebooks_alone(monkeypatch):
     handle = _Handle()
     monkeypatch.setattr(progress, "in_notebook", lambda: True)
     monkeypatch.setattr(progress, "notebook_output", lambda: handle)
-    from jaxid.display import figures
-
     draw = progress.live_figure()
     for errors in ([[4.0]], [[4.0], [1.0]]):
-        import numpy as np
-
         steps = ["start", "+ spring"][: len(errors)]
         draw(lambda e=errors, s=steps: figures.error_falling(s, {"fitted": np.array(e)}))
-    content = [x["application/vnd.plotly.v1+json"]["data"][0]["name"] for x in handle.shown]
+    content = [x["application/vnd.plotly.v1+json"]["data"][0]["name"] for x in handle.shown[1::2]]
     assert content == ["joint 1, fitted"] * 2
+    # Between two figures the place is empty, or the first would stay.
+    assert [x["text/plain"] for x in handle.shown[::2]] == ["", ""]

@@ -43,6 +43,12 @@ def test_without_an_effect_it_is_the_fit(what_if, start, held_out):
     assert seen.simulated[0] == pytest.approx(np.asarray(beyond.runs[0].tau), abs=1e-3)
 
 
+def test_an_effect_of_no_size_changes_nothing(what_if):
+    nothing, none = what_if.answer(jaxid.effects.Spring(joint=2)), what_if.answer(None)
+    assert nothing.fitted == pytest.approx(none.fitted, abs=1e-12)
+    assert nothing.held_out == pytest.approx(none.held_out, abs=1e-12)
+
+
 @pytest.mark.parametrize("beyond", [False, True], ids=["fitted", "held out"])
 def test_the_answer_is_that_of_a_simulation_for_small_effects(what_if, start, held_out, beyond):
     recordings = held_out if beyond else start.recordings

@@ -127,6 +127,9 @@ def _solved(given: tuple[FleetRobot, dict[str, Any]]) -> dict[str, Any]:
     problem, settings = given
     chosen = {**settings, **problem.settings, "progress": False}
     story = discover(problem.loop, problem.recordings, problem.validate, **chosen)
+    if story.interrupted:
+        # Of a robot that was not done nothing is kept, and no other one is begun.
+        raise KeyboardInterrupt
     return story.to_dict()
 
 

@@ -16,13 +16,13 @@ from ..effects import AbstractEffect
 from ..effects import catalogue as known
 from ..estimate import Fit
 from ..estimate.oem import oem_of
+from ..noise import ARFilter
 from ..parameters import Bounds, read_values, write_values
 from ..recording import Recording, Recordings
 from .comparison import Comparison, compare
 from .diagnosis import over_recordings, share_left
 from .hypotheses import amplitudes, free_of
 from .landscape import form
-from .likelihood import score_of
 from .linear import at_rows
 from .predict import Prediction, Predictor, least_squares
 from .score import spanned
@@ -68,6 +68,8 @@ class WhatIf(eqx.Module):
     """A fitted model along its recordings and along others, ready for effects to be tried.
 
     - `settings`: the catalogue's effects that can be asked of the model, at each of their settings.
+    - `absorbed`: how far the model's own values would move without an effect: next to nothing for a
+      fit that converged.
     """
 
     fit: Fit
@@ -75,6 +77,7 @@ class WhatIf(eqx.Module):
     predictor: Predictor
     unseen: Predictor | None
     settings: tuple[AbstractEffect, ...]
+    absorbed: Float[np.ndarray, " absorbed"]
 
     @classmethod
     def of(
@@ -92,14 +95,15 @@ class WhatIf(eqx.Module):
 
         **Raises:** `FitError` where the fitted loop cannot be simulated.
         """
-        given = fit.noise if isinstance(fit.noise, tuple) else ()
         system = System.of(fit)
-        noise = given if len(given) == system.residual.shape[2] else score_of(fit).noise
+        noise = _weights(fit, system)
         _, proposed = offered(system, fit.recordings, catalogue)
         comparison = None if validate is None else compare(fit, validate)
         unseen = None if comparison is None else Predictor.of(System.of(comparison), noise)
         settings = tuple(effect for effect, _ in proposed)
-        return cls(fit, comparison, Predictor.of(system, noise), unseen, settings)
+        predictor = Predictor.of(system, noise)
+        absorbed = predictor.absorbed(system.residual)
+        return cls(fit, comparison, predictor, unseen, settings, absorbed)
 
     def seen(self, held_out: bool = False) -> Seen:
         """The signals of the fitted recordings, or of those held out."""
@@ -129,7 +133,8 @@ class WhatIf(eqx.Module):
         rest, there = _left(self.predictor, effect)
         taken = np.zeros(self.predictor.base.shape[1])
         if again and effect is not None:
-            taken = self.predictor.absorbed(rest)
+            # Less what no effect would move, so that an effect of no size changes nothing.
+            taken = self.predictor.absorbed(rest) - self.absorbed
             rest = _without(self.predictor, rest, taken)
         percent = _percent(self.fit, self.predictor, rest)
         if self.unseen is None or self.comparison is None:
@@ -215,6 +220,15 @@ class WhatIf(eqx.Module):
         """
         refits = Refits(self.fit.recordings, oem_of(self.fit))
         return refits.with_effects(self.fit, [effect], self.predictor.noise)
+
+
+def _weights(fit: Fit, system: System) -> tuple[ARFilter, ...]:
+    """The noise filters that weighted a fit; of a fit without, white noise of its residual."""
+    outputs = system.residual.shape[2]
+    if isinstance(fit.noise, tuple) and len(fit.noise) == outputs:
+        return fit.noise
+    power = np.mean(system.residual[system.mask] ** 2, axis=0)
+    return tuple(ARFilter(np.zeros(0), float(max(x, 1e-300))) for x in power)
 
 
 def _left(predictor: Predictor, effect: AbstractEffect | None) -> tuple[np.ndarray, bool]:

@@ -178,6 +178,8 @@ def live_figure(show: bool = True) -> Callable[[Callable[[], Any]], None]:
         if not handles:
             handles.append(notebook_output())
         content = {"application/vnd.plotly.v1+json": json.loads(make().to_json())}
+        # JupyterLab leaves a figure as it is where another one takes its place at once.
+        handles[0].update({"text/plain": ""}, raw=True)
         handles[0].update({**content, "text/plain": "a figure"}, raw=True)
 
     return draw

@@ -25,6 +25,8 @@ def explore(
     fit: Fit,
     validate: Recording | Recordings | Iterable[Recording] | None = None,
     *,
+    effect: str | None = None,
+    joint: int | None = None,
     catalogue: Sequence[Any] = known,
 ) -> "Explorer":
     """Moves an effect by sliders and shows at once what a fitted model would say with it.
@@ -37,6 +39,7 @@ def explore(
 
     - `fit`: of a loop that can be simulated.
     - `validate`: recordings that the fit has not seen.
+    - `effect`, `joint`: where to begin, by its name as in tables; else with the first one.
     - `catalogue`: as for `diagnose`.
 
     **Raises:** `ModelError` without the extra `notebook`; `FitError` where the fitted loop cannot
@@ -50,7 +53,10 @@ def explore(
             "exploring needs widgets: pip install 'jaxid-robotics[notebook]', and start Jupyter "
             "anew"
         ) from error
-    return Explorer(fit, validate, catalogue)
+    made = Explorer(fit, validate, catalogue)
+    if effect is not None:
+        made.choose(effect, joint)
+    return made
 
 
 class Explorer:
@@ -86,8 +92,9 @@ class Explorer:
             description="refit in full and add", button_style="primary", layout={"width": "auto"}
         )
         self._box = widgets.VBox()
-        self._errors, self._said = widgets.HTML(), widgets.HTML()
+        self._errors, self._said, self._added = (widgets.HTML() for _ in range(3))
         self._figure = widgets.VBox(layout={"width": "100%", "min_width": "0"})
+        self._picture = None
         self._take(fit)
         self._name.observe(lambda _: self._chosen_name(), names="value")
         self._joint.observe(lambda _: self._chosen(), names="value")
@@ -105,6 +112,7 @@ class Explorer:
                 widgets.HBox([self._best, self._full]),
                 self._errors,
                 self._said,
+                self._added,
             ],
             layout={"width": "370px", "flex": "0 0 auto", "padding": "0 12px 0 0"},
         )
@@ -165,7 +173,7 @@ class Explorer:
                 self._say(f"the fit with {name} {found.status.value}")
                 return
             self._take(found)
-            self._say(f"added {name}: the fit {found.status.value}")
+            self._added.value += f"added {html.escape(name)}: the fit {found.status.value}<br>"
         except (JaxidError, KeyboardInterrupt) as error:
             self._say(str(error) or "interrupted, nothing was added")
         finally:
@@ -173,7 +181,7 @@ class Explorer:
 
     def _take(self, fit: Fit) -> None:
         """A fitted model: what can be asked of it, and its recordings."""
-        self.fit, self._at, self._picture = fit, None, None
+        self.fit, self._at = fit, None
         self._what_if = WhatIf.of(fit, self._validate, self._catalogue)
         self._before = self._what_if.answer(None)
         self._offered: dict[str, list[tuple]] = {}
@@ -225,7 +233,7 @@ class Explorer:
         self._moved()
 
     def _chosen_view(self) -> None:
-        """Another recording or joint to look at: a new figure."""
+        """Another recording or joint to look at."""
         torque, position = self.fit.loop.arm.units()
         turned = self._what_if.predictor.system.row != 0
         joint = self._of.value
@@ -233,30 +241,33 @@ class Explorer:
         seen = self._what_if.seen(held_out)
         there = seen.there[recording]
         self._at = recording, there, joint - 1
-        self._moved()
+        self._answered()
         signals = seen.time[recording, there], seen.measured[self._at], seen.simulated[self._at]
         name = f"{'position' if turned else 'torque'} of joint {joint}"
         unit = (position if turned else torque)[joint - 1]
-        self._picture = Picture(*signals, self._rest, name, unit)
-        self._figure.children = (self._picture.widget,)
+        if self._picture is None:
+            self._picture = Picture(*signals, self._rest, name, unit)
+            self._figure.children = (self._picture.widget,)
+        else:
+            self._picture.show(*signals, self._rest, name, unit)
 
     def _moved(self) -> None:
         """Sliders were moved: the answer, in figure and table."""
-        if self._at is None:
+        if self._at is None or self._picture is None:
             return
         began = time.perf_counter()
+        self._answered()
+        self._picture.follow(self._rest)
+        self.milliseconds = 1e3 * (time.perf_counter() - began)
+        said = f"answered in {self.milliseconds:.0f} ms"
+        self._say(said if self.answer.possible else "the loop runs away with these values")
+
+    def _answered(self) -> None:
         self.answer = self._what_if.answer(self.effect, self._again.value)
         rest = self.answer.held_out if self._shown.value[0] else self.answer.fitted
         assert rest is not None
         self._rest = rest[self._at]
-        if self._picture is not None:
-            self._picture.follow(self._rest)
         self._errors.value = _table(self._before, self.answer)
-        self.milliseconds = 1e3 * (time.perf_counter() - began)
-        if self.answer.possible:
-            self._say(f"answered in {self.milliseconds:.0f} ms")
-        else:
-            self._say("the loop runs away with these values")
 
     def _say(self, text: str) -> None:
         self._said.value = f'<span style="opacity:.7">{html.escape(text)}</span>'
@@ -264,8 +275,10 @@ class Explorer:
     def _ipython_display_(self) -> None:
         from IPython.display import display  # type: ignore[import-not-found]
 
-        # What was moved before the figure is on the screen is not in it.
-        self._chosen_view()
+        if self._picture is not None and self._picture.changed:
+            # What was moved before the figure is on the screen is not in it.
+            self._picture = None
+            self._chosen_view()
         display(self.widget)
 
 

@@ -16,8 +16,8 @@ _PREDICTED, _REST = 2, 4
 class Picture:
     """A plotly widget of one recording and joint, two lines of which follow the effect.
 
-    A widget that is not on a screen yet loses what is changed in it, so there is a new one for
-    each view.
+    A widget that is not on a screen yet loses what is changed in it: `changed` says whether there
+    is something to lose.
 
     **Arguments:**
 
@@ -36,11 +36,8 @@ class Picture:
     ) -> None:
         import plotly.graph_objects as go
 
-        self._rows = slice(None, None, max(1, -(-len(time) // _DRAWN)))
-        self._measured = measured
-        time, before, left, rest = (
-            x[self._rows] for x in (time, measured, measured - simulated, rest)
-        )
+        time, before, left, rest = self._drawn(time, measured, measured - simulated, rest)
+        self.changed = False
         panels = [
             [
                 figures.Trace("measured", before, unit),
@@ -54,11 +51,28 @@ class Picture:
         ]
         drawn = figures.signals(time, panels, titles=[name, "residual"])
         drawn.update_layout(height=470, autosize=True, margin={"l": 70, "r": 10, "b": 45})
-        # The axes stay while the effect moves; else nothing but their numbers would be seen to.
-        low, high = float(left.min()), float(left.max())
-        room = 0.4 * (high - low)
-        drawn.update_yaxes(range=[low - room, high + room], row=2, col=1)
+        drawn.update_yaxes(range=_around(left), row=2, col=1)
         self.widget: Any = go.FigureWidget(drawn)
+
+    def show(
+        self,
+        time: Float[np.ndarray, " rows"],
+        measured: Float[np.ndarray, " rows"],
+        simulated: Float[np.ndarray, " rows"],
+        rest: Float[np.ndarray, " rows"],
+        name: str,
+        unit: str,
+    ) -> None:
+        """Another recording or joint, with arguments as for a new one."""
+        time, before, left, rest = self._drawn(time, measured, measured - simulated, rest)
+        self.changed = True
+        lines = before, before - left, before - rest, left, rest
+        with self.widget.batch_update():
+            for trace, y in zip(self.widget.data, lines, strict=True):
+                trace.x, trace.y = time, y
+            self.widget.layout.yaxis.title.text = f"{name} ({unit})"
+            self.widget.layout.yaxis2.title.text = f"residual ({unit})"
+            self.widget.layout.yaxis2.range = _around(left)
 
     def follow(self, rest: Float[np.ndarray, " rows"]) -> None:
         """Draws what the model says with the effect.
@@ -68,7 +82,23 @@ class Picture:
         - `rest`: measured less predicted at all rows, in the unit of the signal.
         """
         drawn = rest[self._rows].astype(np.float32)
-        predicted = self._measured[self._rows].astype(np.float32) - drawn
+        self.changed = True
         with self.widget.batch_update():
-            self.widget.data[_PREDICTED].y = predicted
+            self.widget.data[_PREDICTED].y = self._before - drawn
             self.widget.data[_REST].y = drawn
+
+    def _drawn(
+        self, time: np.ndarray, measured: np.ndarray, *others: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """Rows that are drawn, in single precision; the measured ones are kept."""
+        self._rows = slice(None, None, max(1, -(-len(time) // _DRAWN)))
+        found = [x[self._rows].astype(np.float32) for x in (time, measured, *others)]
+        self._before = found[1]
+        return tuple(found)
+
+
+def _around(residual: np.ndarray) -> list[float]:
+    """A fixed axis for a residual: one that followed it would hide how it changes."""
+    low, high = float(residual.min()), float(residual.max())
+    room = 0.4 * (high - low)
+    return [low - room, high + room]
