@@ -134,7 +134,7 @@ def test_code_of_bring_your_own_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(block, own)
     assert set(asked[0]["columns"]) == {"time", "q", "tau"}
-    assert asked[1]["catalogue"][-1] is own["Hose"]
+    assert [a["catalogue"][-1] for a in asked if "catalogue" in a] == [own["Hose"]]
     # Stretched out level, three masses of 1 kg hang on the first joint at 0.4, 0.7 and 0.9 m.
     q, none = jnp.array([jnp.pi / 2, 0.0, 0.0]), jnp.zeros(3)
     held = own["ThreeLinks"]().bias(q, none)

@@ -89,7 +89,7 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
         )
         own = jax.vmap(lambda x: unflatten(loop)(x).effects)(states)
         load = jax.vmap(lambda at, own: link_load(loop, at, own))(motion, own)
-        motion = dataclasses.replace(motion, load=load)
+        motion = jax.vmap(lambda at, load: dataclasses.replace(at, load=load))(motion, load)
         return a, b, c, d, start, motion, seen
 
     return Linearised(*each(whole, batch.intervals, batch.q0, batch.v0), places=places)

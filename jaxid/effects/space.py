@@ -80,7 +80,7 @@ class BaseTilt(AbstractEffect):
 
 @eqx.filter_jit
 def _slopes(effect: BaseTilt, q: Float[Array, "poses joints"]) -> Float[Array, "rows two"]:
-    """Torque by both slopes at poses at rest, a row a joint."""
+    """Torque by both slopes at poses at rest, one row for each joint."""
     rest, none = jnp.zeros_like(q[0]), jnp.zeros(0)
 
     def torque(slopes: Float[Array, " two"], at: Float[Array, " joints"]):
