@@ -6,8 +6,8 @@ from .comparison import compare as compare
 from .diagnosis import Diagnosis as Diagnosis
 from .difference import ModelDifference as ModelDifference
 from .difference import compare_models as compare_models
-from .effect_curve import EffectCurve as EffectCurve
-from .effect_curve import effect_curve as effect_curve
+from .effect_curves import EffectCurve as EffectCurve
+from .effect_curves import effect_curve as effect_curve
 from .experiment import Experiment as Experiment
 from .experiment import next_experiment as next_experiment
 from .fleet import Fleet as Fleet

@@ -122,7 +122,7 @@ class ModelDifference(AbstractShown):
         lines = [f"first: {self.names[0]}", f"second: {self.names[1]}"]
         if self.score is not None:
             low, high = self.score.interval
-            verdict = "which of them is better cannot be told"
+            verdict = "not told apart"
             if self.score.sure:
                 verdict = f"the {'first' if self.score.value < 0 else 'second'} is better"
             lines.append(

@@ -22,7 +22,7 @@ from ..simulation.loop import ClosedLoop
 from ..storage.saved import save
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
-from .effect_curve import EffectCurve, effect_curve
+from .effect_curves import EffectCurve, effect_curve
 from .floor import SPOKEN
 from .hypotheses import effect_on, on_recordings
 from .landscape import form

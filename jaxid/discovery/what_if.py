@@ -59,7 +59,7 @@ class Answer(eqx.Module):
     effect: AbstractEffect | None
     fitted: Float[np.ndarray, "recordings rows outputs"]
     fitted_percent: Float[np.ndarray, " outputs"]
-    held_out: Float[np.ndarray, "recordings rows outputs"] | None
+    held_out: Float[np.ndarray, "unseen unseen_rows outputs"] | None
     held_out_percent: Float[np.ndarray, " outputs"] | None
     possible: bool
 

@@ -80,10 +80,10 @@ class Explorer:
             "layout": {"width": "100%"},
             "style": {"description_width": "120px"},
         }
-        self._name = widgets.Dropdown(description="effect", **wide)
-        self._joint = widgets.Dropdown(description="joint", **wide)
-        self._shown = widgets.Dropdown(description="recording", **wide)
-        self._of = widgets.Dropdown(description="show joint", **wide)
+        self._name: Any = widgets.Dropdown(description="effect", **wide)
+        self._joint: Any = widgets.Dropdown(description="joint", **wide)
+        self._shown: Any = widgets.Dropdown(description="recording", **wide)
+        self._of: Any = widgets.Dropdown(description="show joint", **wide)
         self._again = widgets.Checkbox(
             value=True, indent=False, description="estimate the other parameters again"
         )
@@ -263,6 +263,7 @@ class Explorer:
         self._say(said if self.answer.possible else "the loop runs away with these values")
 
     def _answered(self) -> None:
+        assert self._at is not None
         self.answer = self._what_if.answer(self.effect, self._again.value)
         rest = self.answer.held_out if self._shown.value[0] else self.answer.fitted
         assert rest is not None

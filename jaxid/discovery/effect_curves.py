@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 _ALL = 0.98
 # A coordinate further down the list must show so much more of the torque.
 _MORE = 0.01
+# Share that some other coordinate must show, for time not to be asked.
+_HALF = 0.5
 _COARSE, _FINE = 30, 100
 _WIDE = 1.96
 
@@ -262,12 +264,13 @@ def _coordinate(
 ) -> tuple[Curve, float]:
     """The coordinate that shows most of a torque, and the share that it shows."""
     joints = [joint, *(j for j in range(1, motion.q.shape[-1] + 1) if j != joint)]
-    names = [(c, j) for j in joints for c in ("v", "q", "tau", "a")] + [("t", 1)]
+    names = [(c, j) for j in joints for c in ("v", "q", "tau", "a")]
     found = [
         Curve(joint=joint, coordinate=c, of=j, signed=signed)  # type: ignore[arg-type]
         for signed in (False, True)
         for c, j in names
     ]
+    found.append(Curve(joint=joint, coordinate="t"))
     if isinstance(effect, Curve):
         found = [effect]
     best, share = found[0], -np.inf
@@ -279,6 +282,9 @@ def _coordinate(
         step = np.diff(y[np.argsort(along, kind="stable")])
         total = float(y @ y)
         shown = 1.0 if total == 0 else max(0.0, 1 - float(step @ step) / (2 * total))
+        # Along one recording every torque is a smooth function of time.
+        if over.coordinate == "t" and share > _HALF:
+            continue
         if shown > share + _MORE:
             best, share = over, shown
     return best, float(share)
