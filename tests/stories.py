@@ -101,7 +101,7 @@ def search_of(case: sim.Case) -> Search:
     return Search(asked, Campaign(None, {}), silent)
 
 
-def silent(*_: object) -> None:
+def silent(*_: object, **__: object) -> None:
     """Says nothing."""
 
 

@@ -28,10 +28,10 @@ def test_a_stretch_that_is_left_out_is_predicted_from_the_others(everywhere):
 
 
 def humming(stretch: int | None) -> jaxid.Recording:
-    """The slide with a hum of 2.3 Hz, throughout or in one stretch."""
+    """The slide with a slow hum, 0.57 Hz, throughout or in one stretch."""
     record, _ = axis(1)
     there = True if stretch is None else np.arange(record.samples) * 6 // record.samples == stretch
-    hum = 1.5 * np.sin(2 * np.pi * 2.3 * record.time) * there
+    hum = 1.5 * np.sin(2 * np.pi * 0.57 * record.time) * there
     tau = record.tau + hum[:, None]
     return jaxid.Recording.from_arrays(record.time, record.q, tau, name="humming")
 

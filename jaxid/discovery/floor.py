@@ -56,7 +56,8 @@ def floor_of(loop: ClosedLoop, recordings: Recordings) -> Floor | None:
         assert moving is not None
         share = 1.0 if band is None else float(np.mean(np.asarray(band.gain[k]) ** 2))
         above = above_motion(r, cutoff, moving, share)
-        levels.append(repeats.get(r.name, above))
+        pairs = zip(repeats.get(r.name, above), above, strict=True)
+        levels.append(tuple(x or y for x, y in pairs))
     return _relative(levels, torque)
 
 

@@ -19,6 +19,8 @@ Compared = Callable[[Sequence[Recording], Sequence[np.ndarray]], Sequence[np.nda
 _ABOVE, _UNTIL = 1.5, 0.9
 # Samples of a window of the spectrum, windows and frequencies that say something.
 _WINDOW, _WINDOWS, _BINS = 64, 6, 6
+# Rows of a difference that say something.
+_ROWS = 20
 # Log of the power in the lower half of the frequencies over that in the upper half, and standard
 # deviations of it, from which noise is not called white; a deviation that is larger tells nothing.
 _COLOURED, _SURE, _UNSURE = 0.15, 2.0, 0.2
@@ -95,7 +97,7 @@ def _relative(x: Float[np.ndarray, " windows"]) -> float:
     return float(np.std(x) / (np.mean(x) * np.sqrt(0.6 * len(x))))
 
 
-def from_repeats(recordings: Recordings, compared: Compared) -> dict[str, tuple[Level, ...]]:
+def from_repeats(recordings: Recordings, compared: Compared) -> dict[str, tuple[Level | None, ...]]:
     """Noise by joint of recordings that repeat a reference, by name, from their difference.
 
     Half of the power of the difference is the noise of each, once what is linear in the difference
@@ -107,7 +109,7 @@ def from_repeats(recordings: Recordings, compared: Compared) -> dict[str, tuple[
     - `compared`: what is compared of signals of two recordings, zero where nothing is.
     """
     named = {r.name: r for r in recordings}
-    found: dict[str, tuple[Level, ...]] = {}
+    found: dict[str, tuple[Level | None, ...]] = {}
     for one, other in repeats_of(recordings):
         length = min(named[one].samples, named[other].samples)
         pair = [_first(named[name], length) for name in (one, other)]
@@ -141,11 +143,14 @@ def _motion(r: Recording) -> tuple[Float[np.ndarray, "samples joints"], ...]:
 
 def _of_difference(
     torque: Float[np.ndarray, " rows"], motion: Float[np.ndarray, "rows signals"]
-) -> Level:
+) -> Level | None:
     there = torque != 0
     x, y = motion[there], torque[there]
-    rest = y - x @ np.linalg.lstsq(x, y, rcond=None)[0] if len(y) else y
-    value = float(np.sqrt(np.sum(rest**2) / (2 * max(len(rest) - x.shape[1], 1))))
+    # Copies of one recording say nothing.
+    if len(y) < _ROWS:
+        return None
+    rest = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
+    value = float(np.sqrt(np.sum(rest**2) / (2 * (len(rest) - x.shape[1]))))
     # Frequencies that share the power: noise that follows itself has fewer than rows.
     power = np.abs(np.fft.rfft(rest)) ** 2
     freedom = max(2 * float(np.sum(power)) ** 2 / max(float(np.sum(power**2)), 1e-300), 1.0)
