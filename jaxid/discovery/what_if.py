@@ -25,7 +25,7 @@ from .hypotheses import amplitudes, free_of
 from .landscape import form
 from .linear import at_rows
 from .predict import Prediction, Predictor, least_squares
-from .score import spanned
+from .score import spanned, whitened
 from .screening import offered
 from .system import System
 from .verify import Refits
@@ -223,12 +223,19 @@ class WhatIf(eqx.Module):
 
 
 def _weights(fit: Fit, system: System) -> tuple[ARFilter, ...]:
-    """The noise filters that weighted a fit; of a fit without, white noise of its residual."""
+    """The noise filters that a fit had, at the levels that it left; white ones where it had none.
+
+    A fit weights each output by what it leaves of it, whatever level its filters came with.
+    """
     outputs = system.residual.shape[2]
+    noise = (ARFilter(np.zeros(0), 1.0),) * outputs
     if isinstance(fit.noise, tuple) and len(fit.noise) == outputs:
-        return fit.noise
-    power = np.mean(system.residual[system.mask] ** 2, axis=0)
-    return tuple(ARFilter(np.zeros(0), float(max(x, 1e-300))) for x in power)
+        noise = tuple(ARFilter(f.coefficients, 1.0) for f in fit.noise)
+    rows = whitened(system.residual, noise, system.mask)[system.mask]
+    power = np.mean(rows**2, axis=0)
+    return tuple(
+        ARFilter(f.coefficients, float(max(x, 1e-300))) for f, x in zip(noise, power, strict=True)
+    )
 
 
 def _left(predictor: Predictor, effect: AbstractEffect | None) -> tuple[np.ndarray, bool]:
