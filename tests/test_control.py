@@ -325,7 +325,7 @@ def test_controller_sees_steps_of_the_encoder():
     ("loop", "law"),
     [
         (jaxid.scara(), "PD"),
-        (jaxid.scara(Sampled(PD(**GAINS), every=0.01)), "Sampled"),
+        (jaxid.scara(Sampled(PD(**GAINS), every=0.01)), "PD"),
         (jaxid.emps(), "Cascade"),
     ],
 )
