@@ -64,7 +64,7 @@ def test_friction_that_varies_with_position_is_shown_over_position():
         )[0]
         for x in found.x
     ]
-    inside = np.abs(found.x) < 1.2
+    inside = np.abs(found.x) < 1.0
     size = np.abs(expected).max()
     assert found.torque[inside] == pytest.approx(np.array(expected)[inside], abs=0.1 * size)
 

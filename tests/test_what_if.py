@@ -69,23 +69,18 @@ def test_the_answer_is_that_of_a_simulation_for_small_effects(what_if, start, he
     assert off[1] < 0.6 * off[0]
 
 
-def test_with_its_parameters_estimated_again_it_is_a_refit_for_small_effects(what_if, start):
-    nothing, method = (
-        what_if.answer(None).fitted,
-        dataclasses.replace(start.method, oem=dataclasses.replace(start.method.oem, start="given")),
-    )
-    off = []
-    for size in (0.02, 0.002):
-        effect = jaxid.effects.TorqueOffset(joint=2, level=size)
-        predicted = np.concatenate(list(nothing - what_if.answer(effect).fitted))
-        loop = start.loop.add(effect)
-        held = loop.hold(*(name for name in loop.names if name not in start.loop.names))
-        fit = jaxid.fit(held, start.recordings, method)
-        found = np.concatenate(start.residuals) - np.concatenate(fit.residuals)
-        off.append(np.linalg.norm(predicted - found) / np.linalg.norm(found))
-    # The first term of a series again; fits end within a hundredth of a deviation.
-    assert off[1] < 0.1
-    assert off[1] < 0.6 * off[0]
+@pytest.mark.parametrize("size", [0.02, 0.008])
+def test_with_its_parameters_estimated_again_it_is_a_refit(what_if, start, size):
+    effect = jaxid.effects.TorqueOffset(joint=2, level=size)
+    predicted = what_if.answer(None).fitted - what_if.answer(effect).fitted
+    loop = start.loop.add(effect)
+    held = loop.hold(*(name for name in loop.names if name not in start.loop.names))
+    oem = dataclasses.replace(start.method.oem, start="given")
+    fit = jaxid.fit(held, start.recordings, dataclasses.replace(start.method, oem=oem))
+    found = np.stack(start.residuals) - np.stack(fit.residuals)
+    off = np.linalg.norm((predicted - found)[..., 1]) / np.linalg.norm(found[..., 1])
+    # A fit filters the first samples too, whose past is not known; the answer leaves them out.
+    assert off < 0.1
 
 
 def test_the_best_values_are_those_of_the_simulator(what_if):
