@@ -44,6 +44,8 @@ def recorded(seed, spring=0.0):
 class Story:
     """What a discovery gives, without one."""
 
+    interrupted = False
+
     def __init__(self, loop, recordings):
         self.found = {
             "verdict": "adequate",

@@ -17,16 +17,11 @@ from jaxid.effects import (
     CableDrag,
     CarriedBody,
     Gravity,
-    LoadDependentFriction,
     Motion,
     Payload,
-    RotorInertia,
-    Spring,
     Tilt,
-    smooth_sign,
 )
 from jaxid.effects import recording_label as label
-from jaxid.simulation.dynamics import inverse
 from tests.test_serial import PINOCCHIO, POLAR, pinocchio_of, robots
 
 pinocchio = pytest.importorskip("pinocchio")
@@ -178,23 +173,6 @@ def test_a_payload_has_the_parameters_that_motions_show(arm):
     shown = [PINOCCHIO[k] for k in carried]
     if not np.any(made.chain.tip):
         assert np.linalg.matrix_rank(np.vstack(rows)[:, shown], tol=1e-7) == len(carried)
-
-
-def test_what_a_rotor_takes_does_not_pass_its_gear(arm):
-    """Friction of a gear by the torque that reaches the link: bodies and what acts on them."""
-    made = arm[0]
-    ratio, inertia = 0.2, 0.7
-    joint = LoadDependentFriction(joint=1, ratio=ratio, smoothing=0.01)
-    rotor, spring = RotorInertia(joint=1, inertia=inertia), Spring(joint=1, stiffness=3.0)
-    loop = jaxid.ClosedLoop(made, jaxid.control.Tracking(), (joint, rotor, spring))
-    for q, v, a in zip(*map(jnp.asarray, states(made, 3)), strict=True):
-        link = made.inverse(q, v, a)[0] + 3.0 * q[0]
-        friction = ratio * jnp.abs(link) * smooth_sign(v[0], joint.smoothing)
-        expected = link + inertia * a[0] + friction
-        none = jnp.zeros(0)
-        motion = Motion(none.sum(), q, v, a, expected * jnp.eye(len(q))[0], none, jnp.asarray(0))
-        asked = inverse(loop, motion, (none,) * 3)
-        np.testing.assert_allclose(asked[0], expected, rtol=1e-12)
 
 
 # --- which arm is offered which -----------------------------------------------------------------

@@ -8,15 +8,17 @@ import json
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from ..errors import require
 from ._checks import numeric
 from ._problem import problem
 from ._table import Table, from_frame
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _EPISODE = re.compile(r"episode_(\d+)")
 # What features are called, and the endings of names where one feature holds several signals.
@@ -93,7 +95,7 @@ def _frames(
     features: dict[str, Any],
     largest: int,
     refuse: Callable[[int], Exception],
-) -> pd.DataFrame:
+) -> "pd.DataFrame":
     parquet = require("pyarrow.parquet", "parquet")
     files = sorted((folder / "data").rglob("*.parquet"))
     if not files:
@@ -114,10 +116,12 @@ def _frames(
             raise refuse(size)
         names = [name for name in file.schema_arrow.names if name in numbers]
         frames.append(file.read(columns=names).to_pandas(ignore_metadata=True))
+    import pandas as pd
+
     return pd.concat(frames, ignore_index=True)
 
 
-def _table(source: str, frame: pd.DataFrame, told: dict[str, Any]) -> Table:
+def _table(source: str, frame: "pd.DataFrame", told: dict[str, Any]) -> Table:
     """Columns of an episode: each feature as a whole, and each of its parts by name."""
     columns = dict(from_frame(source, frame).columns)
     names, about = {}, []

@@ -144,8 +144,8 @@ def effect_loads(
 ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
     """Torque that all effects together ask of the drives, and that of the links, `(joints,)` each.
 
-    Effects of the load come last, since they are given what the others leave of the torque, rotors
-    included; where acceleration is solved for, what is proportional to it is not taken off.
+    Effects of the load come last, since they are given what the others leave of the torque. What is
+    proportional to acceleration, which is solved for, is not taken off.
 
     **Arguments:**
 
@@ -155,7 +155,7 @@ def effect_loads(
     - `curves`: False to leave out what needs an acceleration that is not known yet.
     - `inertia`: False to leave out what is proportional to acceleration.
     """
-    drive = link = jnp.zeros_like(motion.v)
+    drive = link = ahead = jnp.zeros_like(motion.v)
     behind = motion if links is None else links
     own = [
         (effect, state)
@@ -173,10 +173,13 @@ def effect_loads(
             link = link + torque
             continue
         drive = drive + torque
+        if effect.inertial:
+            torque = effect.torque(dataclasses.replace(seen, a=jnp.zeros_like(seen.a)))
+        ahead = ahead + torque
     loaded = [(effect, state) for effect, state in own if effect.loaded]
     if loaded:
         load = link_load(loop, behind, states)
-        left = dataclasses.replace(motion, tau=motion.tau - drive + push, load=load)
+        left = dataclasses.replace(motion, tau=motion.tau - ahead + push, load=load)
         for effect, state in loaded:
             drive = drive + effect.torque(dataclasses.replace(left, state=state))
     return drive, link
