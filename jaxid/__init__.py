@@ -7,8 +7,8 @@ from typing import Any as _Any
 
 __version__ = "0.1.0"
 
-# JAX hangs a callback on the garbage collector, in which a Ctrl-C gets lost. Importing takes
-# seconds, and nothing of it is garbage.
+# JAX registers a callback with the garbage collector, and a Ctrl-C during the callback is lost.
+# Importing takes seconds and produces no garbage.
 _collecting = _gc.isenabled()
 _gc.disable()
 
@@ -65,7 +65,7 @@ from .storage.saved import load as load  # noqa: E402
 from .storage.saved import save as save  # noqa: E402
 
 if _collecting:
-    # What was imported counts as old, so that no collection is due at once.
+    # Move the imported objects to the oldest generation, so that no collection is due immediately.
     _gc.freeze()
     _gc.unfreeze()
     _gc.enable()
@@ -92,8 +92,8 @@ if _TYPE_CHECKING:
     from .notebook import explore as explore
     from .report import write_report as write_report
 
-# The rooms of the upper floors come with the first name that is asked of them: a program that
-# simulates and fits does without, and they are a third of what there is to import.
+# The higher-level subpackages are imported when a name of theirs is first used: a program that only
+# simulates and fits does not need them, and they take a third of the import time.
 _LATER = {
     "discovery": (
         "Comparison",

@@ -12,9 +12,9 @@ BODY = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
 
 
 class Chain(eqx.Module):
-    """Joints one after the other, each with a link that moves with it.
+    """A serial chain of joints, each with a link that moves with it.
 
-    - `rotations`, `offsets`: from the frame of the link before to that of the joint at zero, m.
+    - `rotations`, `offsets`: from the previous link's frame to the joint's frame at zero, m.
     - `axes`: unit vectors in the joint's frame, along which it slides or about which it turns.
     - `gravity`: in the base's frame, m/s².
     - `slides`: whether a joint slides.
@@ -119,11 +119,11 @@ class Chain(eqx.Module):
 
 
 class InSpace(eqx.Module):
-    """An arm as what loads it in space sees it.
+    """The properties of an arm that determine its loads in space.
 
     - `chain`: its joints. `bodies`: `BODY` of each link.
-    - `carried`: places in `BODY` of what a body at the tip shows of its own in any motion, its mass
-      first; all ten of an arm that moves its tip freely.
+    - `carried`: indices in `BODY` of the parameters of a body at the tip that some motion can
+      identify, its mass first; all ten for an arm that moves its tip freely.
     """
 
     chain: Chain
@@ -132,14 +132,14 @@ class InSpace(eqx.Module):
 
 
 def moved_body(body: Float[Array, "10"], place: Float[Array, "3"]) -> Float[Array, "10"]:
-    """`BODY` about the origin of a frame, of a body given about a place in it (parallel axes).
+    """`BODY` about the origin of a frame, for a body given about another point (parallel axes).
 
     **Arguments:**
 
-    - `body`: about the place, along the frame's axes. `place`: in the frame, m.
+    - `body`: about the point, along the frame's axes. `place`: the point in the frame, m.
     """
     moment, mass = body[6:9], body[9]
-    # Linear in the body: its mass need not be above zero.
+    # Linear in the body, so that its mass may be zero or negative.
     both = jnp.outer(place, moment) + jnp.outer(moment, place) + mass * jnp.outer(place, place)
     shift = jnp.trace(both) * jnp.eye(3) - both
     return jnp.concatenate([body[:6] + shift[jnp.triu_indices(3)], moment + mass * place, body[9:]])

@@ -10,8 +10,9 @@ import equinox as eqx
 import jax
 import jax.extend.backend
 
-# JAX has no public way to ask either. Where a later version has moved them, the flag is set as if
-# no backend ran, which does nothing where one does, and XLA's own level stays.
+# JAX has no public function for either question. If a later version has moved these functions, the
+# flag is set as if no backend ran. If one does run, the flag has no effect, and XLA's own level
+# stays.
 try:
     from jax._src.core import trace_state_clean as _nothing_is_traced
 except ImportError:
@@ -25,8 +26,8 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 _EXTRA = "xla_backend_extra_options"
-# LLVM's later passes, kernels that go through MLIR first, and modules cut into many parts cost
-# time and make no program like these faster.
+# LLVM's later passes, kernels that go through MLIR first, and modules split into many parts take
+# time to compile and make none of these programs faster.
 _OPTIONS: dict[str, int | bool] = {
     "xla_backend_optimization_level": 1,
     "xla_cpu_use_fusion_emitters": False,
@@ -40,10 +41,10 @@ def set_loop_threshold() -> None:
 
     XLA's CPU runtime calls one kernel for each operation of a loop's body, which takes five times
     as long as the physics of a few joints. Its own limit, 1 kB, is below any robot's state, and
-    XLA takes this option from the environment alone.
+    XLA reads this option only from the environment.
 
-    Nothing is changed where `JAXID_SET_XLA_FLAGS` is 0, where the user has set
-    `xla_backend_extra_options`, or where a backend runs, since XLA has read its flags by then.
+    Nothing is changed if `JAXID_SET_XLA_FLAGS` is 0, if the user has set
+    `xla_backend_extra_options`, or if a backend runs, since XLA has read its flags by then.
     """
     if os.environ.get("JAXID_SET_XLA_FLAGS") == "0" or _user_sets(_EXTRA) or _backend_runs():
         return
@@ -51,19 +52,19 @@ def set_loop_threshold() -> None:
 
 
 def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """`equinox.filter_jit`, with options of XLA for the CPU that make compiling quick.
+    """`equinox.filter_jit`, with XLA options for the CPU that shorten compilation.
 
     Programs then compile in less time and run as fast (docs/process.md has numbers). An option
-    that the user's `XLA_FLAGS` set stays theirs; accelerators get none. A call inside another
-    program, or under a transformation such as `jax.grad`, is compiled as what surrounds it asks
-    for: JAX refuses options there.
+    that the user's `XLA_FLAGS` set is left unchanged; accelerators get none. A call inside another
+    program, or under a transformation such as `jax.grad`, is compiled with the options of the
+    surrounding program, since JAX refuses options there.
 
     **Arguments:**
 
     - `fun`: a pure function; arrays are traced, everything else is static.
     """
 
-    # Made at the first call: two dozen of them would be felt in the time of `import jaxid`.
+    # Made at the first call: two dozen of them would noticeably slow down `import jaxid`.
     @functools.cache
     def jitted(outermost: bool) -> Callable[_Arguments, _Result]:
         options = _options() if outermost else {}
@@ -79,7 +80,7 @@ def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result
 
 @functools.cache
 def _options() -> dict[str, int | bool]:
-    """Options of this process's programs; starts the backends."""
+    """Compiler options for the programs of this process; starts the backends."""
     if set(jax.extend.backend.backends()) != {"cpu"}:
         return {}
     return {name: value for name, value in _OPTIONS.items() if _is_ours(name, value)}
@@ -97,7 +98,7 @@ def _is_ours(option: str, value: int | bool) -> bool:
 
 
 def _user_sets(flag: str) -> bool:
-    """Whether `XLA_FLAGS` have the flag, or may have it: they can name a file of flags instead."""
+    """Whether `XLA_FLAGS` has the flag, or may have it, since it can name a file of flags."""
     flags = os.environ.get("XLA_FLAGS", "").strip()
     return flag in flags or (flags != "" and not flags.startswith("-"))
 
@@ -105,7 +106,7 @@ def _user_sets(flag: str) -> bool:
 def keep_programs(folder: str | Path | None = None) -> None:
     """Keeps compiled programs between processes: compiling is most of what a user waits for.
 
-    The command `jaxid` does so by itself. A cache that JAX was given already is left as it is.
+    The command `jaxid` does so by itself. If JAX already has a cache, it is left unchanged.
 
     **Arguments:**
 
@@ -115,6 +116,6 @@ def keep_programs(folder: str | Path | None = None) -> None:
         return
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     jax.config.update("jax_compilation_cache_dir", str(folder or base / "jaxid"))
-    # The small ones too: a fit has dozens, and each takes longer to compile than to read.
+    # Small programs are kept too: a fit has dozens, and each takes longer to compile than to read.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

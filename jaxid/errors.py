@@ -19,11 +19,11 @@ class RecordingError(JaxidError, ValueError):
 
 
 class ModelError(JaxidError, ValueError):
-    """A model is put together in a way that has no meaning."""
+    """A model is put together in a way that makes no sense."""
 
 
 class FitError(JaxidError, RuntimeError):
-    """An estimate was asked for that the data or the settings do not allow."""
+    """The data or the settings do not allow the requested estimate."""
 
 
 class SaveError(JaxidError, ValueError):
@@ -31,9 +31,9 @@ class SaveError(JaxidError, ValueError):
 
 
 class NoiseError(FitError):
-    """A noise filter was asked for that the residuals do not allow.
+    """The residuals do not allow the requested noise filter.
 
-    `fit` is what had been estimated by then, None where nothing had.
+    `fit` is the estimate up to that point, None if there is none.
     """
 
     def __init__(self, message: str, fit: Any = None):
@@ -50,11 +50,11 @@ class MissingExtraError(JaxidError, ImportError):
 
 
 class JaxidWarning(UserWarning):
-    """Something is likely, not surely, a mistake."""
+    """Something is probably, but not certainly, a mistake."""
 
 
 def sentence(source: str, what: str, remedy: str) -> str:
-    """One printable sentence about a file or recording, whatever it holds.
+    """One sentence about a file or recording, in which unprintable characters become spaces.
 
     **Arguments:**
 
@@ -78,7 +78,7 @@ def brief(value: object) -> str:
 
 
 def near(name: str, candidates: Iterable[str]) -> str:
-    """` (did you mean 'x'?)` when a candidate comes close to `name`, else nothing."""
+    """` (did you mean 'x'?)` if a candidate is close to `name`, otherwise an empty string."""
     by_folded = {candidate.casefold(): candidate for candidate in candidates}
     close = difflib.get_close_matches(name.casefold(), list(by_folded), n=1, cutoff=0.7)
     return f" (did you mean {brief(by_folded[close[0]])}?)" if close else ""
@@ -103,13 +103,13 @@ def require(module: str, extra: str) -> ModuleType:
 
 
 def check_words(settings: Any) -> None:
-    """Refuses a word that is none of those which a field's `Literal` lists.
+    """Refuses a value that is not listed in the `Literal` of its field.
 
     **Arguments:**
 
     - `settings`: a dataclass.
 
-    **Raises:** `FitError` that names the field and its words.
+    **Raises:** `FitError` that names the field and its allowed values.
     """
     for field in dataclasses.fields(settings):
         words, value = _words(field.type), getattr(settings, field.name)
@@ -121,7 +121,7 @@ def check_words(settings: Any) -> None:
 
 
 def _words(annotation: Any) -> tuple[str, ...]:
-    """The strings of a `Literal`, also of one among others in a union."""
+    """The strings of a `Literal`, which may be a member of a union."""
     if get_origin(annotation) is Literal:
         return tuple(word for word in get_args(annotation) if isinstance(word, str))
     return tuple(word for part in get_args(annotation) for word in _words(part))

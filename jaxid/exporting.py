@@ -24,17 +24,18 @@ def write_urdf(
     base: str | None = None,
     tip: str | None = None,
 ) -> Path:
-    """Writes a URDF back with identified bodies and friction, all else as it was.
+    """Writes a copy of a URDF with identified bodies and friction; the rest is unchanged.
 
-    Each joint's link gets the body of all that moves with it; what is fixed to it is left without
-    one. `<dynamics>` gets viscous and Coulomb friction. A URDF has no rotors: `write_mjcf` does.
+    Each joint's link gets the inertia of everything that moves with it; links fixed to it get none.
+    `<dynamics>` gets viscous and Coulomb friction. A URDF cannot describe rotors; `write_mjcf`
+    writes them.
 
     **Arguments:**
 
     - `loop`: of a `SerialArm`, fitted.
     - `source`: the URDF that the arm was read from, path or text. `path`: where to write.
     - `bodies`: as `physical_bodies` gives them, `(joints, 10)`; the loop's own where None.
-    - `base`, `tip`: as they were given to `SerialArm.from_urdf`.
+    - `base`, `tip`: as given to `SerialArm.from_urdf`.
 
     **Raises:** `ModelError` for a loop that is not of this URDF.
     """
@@ -74,8 +75,8 @@ def write_mjcf(
 ) -> Path:
     """Writes a MuJoCo model of the arm: bodies, rotors (armature), viscous and dry friction.
 
-    Under a law of position and velocity with constant gains, joints get position actuators as well;
-    `simulator_terms` says what of the drives that leaves out.
+    If the law has constant gains on position and velocity, joints get position actuators as well;
+    `simulator_terms` lists the properties of the drives that are left out.
 
     **Arguments:**
 
@@ -179,5 +180,5 @@ def _inertial(body: Float[np.ndarray, "10"]) -> Any:
 
 
 def _text(*values: float) -> str:
-    """Numbers as XML has them, with all their digits."""
+    """Numbers as XML text, with all their digits."""
     return " ".join(repr(float(x)) for x in values)

@@ -1,8 +1,8 @@
 """LAPACK's decompositions of small matrices, one after the other under `vmap`.
 
-jaxlib (0.10) hands a batch of matrices out to the threads of the pool of which the caller is one.
-Where two batches are in flight on two cores both threads wait, nobody works, and the program
-stands still for good. A matrix by itself is done where it is asked for.
+jaxlib (0.10) distributes a batch of matrices over the threads of a pool to which the caller
+belongs. If two batches run on two cores at once, both threads wait for each other and the program
+deadlocks. A single matrix is decomposed in the calling thread.
 """
 
 import jax
@@ -26,7 +26,7 @@ def _exponential(matrix: Float[Array, "size size"]) -> Float[Array, "size size"]
 
 @jax.custom_jvp
 def exponential(matrix: Float[Array, "size size"]) -> Float[Array, "size size"]:
-    """The matrix exponential, whose approximation by fractions is solved for."""
+    """The matrix exponential, by a rational approximation that needs a linear solve."""
     return _exponential(matrix)
 
 
@@ -36,7 +36,7 @@ def _(primals, tangents):
     (matrix,), (along,) = primals, tangents
     n = matrix.shape[-1]
     both = _exponential(jnp.block([[matrix, along], [jnp.zeros_like(matrix), matrix]]))
-    # The value by itself, since under `vmap` it need not have the axis that its slopes have.
+    # The value is computed apart, since under `vmap` it may lack the batch axis of its slopes.
     return _exponential(matrix), both[:n, n:]
 
 
@@ -51,5 +51,5 @@ def column_basis(
 
 @sequential_vmap
 def smallest_eigenvalue(matrix: Float[Array, "size size"]) -> Float[Array, ""]:
-    """Of a symmetric matrix."""
+    """The smallest eigenvalue of a symmetric matrix."""
     return jnp.linalg.eigvalsh(matrix)[0]

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from .errors import ModelError
 
 if TYPE_CHECKING:
-    # Fields take numbers and hold arrays: their converter is out of a type checker's sight.
+    # Fields take numbers and hold arrays: a type checker does not see their converter.
     Scalar: TypeAlias = Any
     Vector: TypeAlias = Any
 else:
@@ -34,7 +34,7 @@ def as_float64(value: Any) -> Any:
 
 
 class Declaration(eqx.Module):
-    """What a field says about the parameter it holds."""
+    """Properties of a parameter, as declared by its field."""
 
     symbol: str
     unit: str
@@ -60,20 +60,20 @@ def parameter(
 
     **Arguments:**
 
-    - `default`: value where none is given; in the unit below.
+    - `default`: value if none is given; in the unit below.
     - `symbol`: its name in the literature, without the joint (`"Fv"`).
     - `unit`: SI unit as shown in tables.
     - `lower`, `upper`: bounds that estimates keep to.
     - `scale`: typical size.
-    - `free`: whether a fit estimates it unless told otherwise.
-    - `linear`: whether torque is linear in it; regressions leave the others at their values.
+    - `free`: whether a fit estimates it by default.
+    - `linear`: whether torque is linear in it; regressions hold the other parameters fixed.
     """
     declaration = Declaration(symbol, unit, float(lower), float(upper), float(scale), free, linear)
     extra = {} if default is dataclasses.MISSING else {"default": default}
     return eqx.field(converter=as_float64, metadata={"parameter": declaration}, **extra)
 
 
-# Metadata of a field whose module is known: its parameters are numbers, none of the model's own.
+# Metadata of a field whose module is known, so that its parameters are not parameters of the model.
 KNOWN = MappingProxyType({"known": True})
 
 
@@ -82,11 +82,10 @@ Place: TypeAlias = tuple[str | int, ...]
 
 
 class Parameter(eqx.Module):
-    """One parameter of a model: its declaration, its unique name and where it lives.
+    """One parameter of a model: its declaration, its unique name and its place in the model.
 
     A field that holds several values (the coefficients of a curve) is one parameter with `size`
-    above one. Its values are called by number, or by the `labels` that the owner's `field_names`
-    holds.
+    above one. Its values are named by number, or by the `labels` in the owner's `field_names`.
     """
 
     name: str = eqx.field(static=True)
@@ -99,7 +98,7 @@ class Parameter(eqx.Module):
 
     @property
     def place(self) -> Place:
-        """Where it lives: the attributes and tuple indices that lead to it."""
+        """Its place in the model: the attributes and tuple indices that lead to it."""
         return self.where.steps  # type: ignore[attr-defined]
 
     @property
@@ -113,14 +112,14 @@ class Parameter(eqx.Module):
 
 
 def sliding_unit(unit: str) -> str:
-    """The unit of a parameter declared for a turning joint when its joint slides: N·m to N."""
+    """The unit, for a sliding joint, of a parameter declared for a turning one: N·m becomes N."""
     unit = unit.replace("N·m", "N").replace("rad", "m").replace("kg·m²", "kg")
-    # Brackets around one unit alone say nothing: m/(N) is m/N.
+    # Brackets around a single unit are superfluous: m/(N) is m/N.
     return re.sub(r"\((\w+)\)", r"\1", unit)
 
 
 class _Path(eqx.Module):
-    """Walks attributes and tuple indices; hashable, so that it can be static."""
+    """Follows attributes and tuple indices; hashable, so that it can be static."""
 
     steps: Place = eqx.field(static=True)
 
@@ -145,8 +144,8 @@ def _declared(module: Any, steps: Place) -> Iterator[tuple[Any, str, _Path]]:
 def list_parameters(model: Any) -> tuple[Parameter, ...]:
     """All parameters declared anywhere in a module, in the order of its fields.
 
-    The name is the symbol followed by the owner's joint, if it has one; when two would be the
-    same, the later gets `_2`, `_3` and so on.
+    The name is the symbol followed by the owner's joint, if it has one. If two names would be
+    equal, the later gets `_2`, `_3` and so on.
     """
     leaves, structure = jax.tree.flatten(model)
     return _listed(structure, tuple(np.shape(leaf) for leaf in leaves))
@@ -154,7 +153,7 @@ def list_parameters(model: Any) -> tuple[Parameter, ...]:
 
 @lru_cache(maxsize=1024)
 def _listed(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Parameter, ...]:
-    """The parameters of modules of one structure: a fit asks for them dozens of times."""
+    """The parameters of a module, cached by structure, since a fit needs them dozens of times."""
     model = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(s, float) for s in shapes])
     found: list[Parameter] = []
     taken: set[str] = set()
@@ -209,7 +208,9 @@ def write_values(model: Any, parameters: Sequence[Parameter], values: Vector) ->
 
 
 def set_by_name(model: Any, **values: float) -> Any:
-    """The model with the named parameters set: one that holds several whole, or as `name[1]`, ….
+    """The model with the named parameters set.
+
+    A parameter that holds several values is set as a whole, or by element as `name[1]`, ….
 
     **Raises:** `ModelError` for a name the model does not have.
     """
@@ -233,7 +234,7 @@ def set_by_name(model: Any, **values: float) -> Any:
 
 
 def _whole(model: Any, known: dict[str, Parameter], values: dict[str, float]) -> dict[str, Any]:
-    """Values by parameter, those given as `name[1]` put into what the model holds."""
+    """Values by parameter; those given as `name[1]` replace elements of the model's values."""
     found: dict[str, Any] = {}
     labelled = {n: (p.name, k) for p in known.values() for k, n in enumerate(p.labels, start=1)}
     for name, value in values.items():
@@ -252,7 +253,7 @@ def _whole(model: Any, known: dict[str, Parameter], values: dict[str, float]) ->
 class Bounds(eqx.Module):
     """Maps unbounded coordinates to parameter values inside their bounds.
 
-    Next to the identity away from a bound, so that Gauss-Newton steps stay Gauss-Newton steps.
+    Away from a bound the map is almost the identity, so that it hardly changes Gauss-Newton steps.
     """
 
     lower: Vector
@@ -298,9 +299,9 @@ class Bounds(eqx.Module):
         )
 
     def moved_inside(self, values: Vector) -> Vector:
-        """The values, `(parameters,)`, those on a bound or beyond it moved just inside.
+        """The values, `(parameters,)`, with those on or beyond a bound moved just inside.
 
-        Those that are inside stay, however near: a small robot's values are all near zero.
+        Values inside stay, however close to a bound: all values of a small robot are close to zero.
         """
         within = (values > self.lower) & (values < self.upper)
         return jnp.where(within, values, self.inside(self.outside(values)))

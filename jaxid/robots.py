@@ -56,7 +56,7 @@ def emps(controller: AbstractController | None = None) -> ClosedLoop:
     """
     friction = Viscous(joint=1, coefficient=100.0), Coulomb(joint=1, level=10.0, smoothing=5e-5)
     effects = (*friction, TorqueOffset(joint=1))
-    # At these speeds the sign's smoothing shows in the force, and nobody knows it: fits find it.
+    # At these speeds the smoothing of the sign affects the force. It is unknown, and so estimated.
     law = controller or Cascade()
     return ClosedLoop(Axis(), law, effects, name="emps").free("eps1")
 
@@ -77,11 +77,11 @@ def serial(
     **Arguments:**
 
     - `source`: path of the URDF, or its text.
-    - `controller`: its law; where None it is not known, `Tracking()`.
+    - `controller`: its law; `Tracking()` if None, for an unknown law.
     - `rotors`: inertia of each drive at its joint, kg·m² or kg; estimated from zero where None.
-    - `gears`: turns of each motor for those of each joint, `(joints, joints)`, where motors drive
-      more than their own joint.
-    - `bodies`: `"drawn"` to leave the links' bodies as the file has them, `"free"` to estimate
+    - `gears`: turns of each motor per turn of each joint, `(joints, joints)`, if motors drive more
+      than their own joint.
+    - `bodies`: `"drawn"` to leave the links' bodies as they are in the file, `"free"` to estimate
       their base parameters.
     - `base`, `tip`, `gravity`: as for `SerialArm.from_urdf`.
 
@@ -103,10 +103,10 @@ def serial(
     loop = ClosedLoop(arm, controller or Tracking(), effects, name=found.name)
     held = [p.name for p in loop.parameters if p.declaration.symbol == "base"]
     if bodies == "free":
-        # The first rotor's inertia, and others', are parts of base parameters.
+        # The inertias of the first rotor and of some others are parts of base parameters.
         held = [f"Ia{j}" for j, inside in enumerate(arm.absorbed_rotors(), start=1) if inside]
     elif rotors is not None:
         held += [f"Ia{j}" for j in range(1, n + 1)]
-    # How friction turns over near standstill nobody knows, and where motions rest it matters most.
+    # The smoothing of friction near standstill is unknown, and matters most for motions with rests.
     smoothings = [p.name for p in loop.parameters if p.declaration.symbol == "eps"]
     return loop.hold(*held).free(*smoothings)

@@ -1,4 +1,4 @@
-"""The law of quasi-direct drives, told anew with every command (their "MIT mode")."""
+"""The law of quasi-direct drives, whose gains come with every command (their "MIT mode")."""
 
 import dataclasses
 
@@ -14,11 +14,11 @@ from .pd import _vector
 
 
 class Impedance(AbstractController):
-    """tau = clip(kp (q_ref - q) + kd (v_ref - v) + tau_ff, ±limit), all of it from the recording.
+    """tau = clip(kp (q_ref - q) + kd (v_ref - v) + tau_ff, ±limit), commanded by the recording.
 
     Position, velocity, both gains and torque are commanded with every sample and hold until the
-    next, as on the bus of Mini Cheetah's actuators and of those that took its protocol over (Katz
-    2018). Where the drive is off (`on`), it gives no torque.
+    next, as on the bus of Mini Cheetah's actuators and of others that use its protocol (Katz 2018).
+    While the drive is off (`on`), it gives no torque.
 
     **Arguments:**
 
@@ -28,9 +28,9 @@ class Impedance(AbstractController):
     limit: Float[Array, " joints"] = eqx.field(converter=_vector, default=np.inf)
 
     def signals(self, recording: Recording) -> Signals:
-        """Positions and torques that were commanded, `(samples, joints)`.
+        """Commanded positions and torques, `(samples, joints)`.
 
-        **Raises:** `ModelError` where the recording has no reference or no gains.
+        **Raises:** `ModelError` if the recording has no reference or no gains.
         """
         for name in ("kp", "kd"):
             if getattr(recording, name) is None:

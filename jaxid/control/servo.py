@@ -16,18 +16,18 @@ from .pd import _vector
 class Servo(AbstractController):
     """volts = supply · clip(gain kp e - damping v, ±duty), with e = q_ref - q beyond the deadband.
 
-    The recorded `tau` is in volts, and `jaxid.effects.DCMotor` makes a torque of them. Since they
-    follow from the position, fits compare positions. `kp` is the recording's, where it has one, and
-    1 where not; so is `supply`. Where the recording says that the drive is off (`on`), it gives no
-    voltage. Goals hold from sample to sample. `Sampled(Servo(...), every=...)` is a servo that
-    computes its law at ticks.
+    The recorded `tau` is in volts, and `jaxid.effects.DCMotor` converts it to torque. Since the
+    voltage follows from the position, fits compare positions. `kp` is taken from the recording if
+    it has one, and is 1 otherwise; so is `supply`. While the recording says that the drive is off
+    (`on`), it gives no voltage. Goals hold from sample to sample. `Sampled(Servo(...), every=...)`
+    is a servo that computes its law at ticks.
 
     **Arguments:**
 
     - `supply`: voltage at full duty, `(joints,)`, V.
-    - `gain`: duty cycle by error, `(joints,)`, 1/rad (1/m), of one unit of the recording's `kp`.
-    - `damping`: duty cycle by measured velocity, `(joints,)`, s/rad (s/m).
-    - `deadband`: errors up to this are taken for none, `(joints,)`, rad (m).
+    - `gain`: duty cycle per error for a recorded `kp` of one, `(joints,)`, 1/rad (1/m).
+    - `damping`: duty cycle per measured velocity, `(joints,)`, s/rad (s/m).
+    - `deadband`: errors up to this count as zero, `(joints,)`, rad (m).
     - `duty`: largest duty cycle, `(joints,)`.
     """
 

@@ -1,4 +1,4 @@
-"""What cables and hoses along an arm do: they pull on several joints."""
+"""Effects of cables and hoses along an arm, which pull on several joints."""
 
 from collections.abc import Iterable
 
@@ -12,15 +12,15 @@ from ._scene import Scene
 
 
 class CableDrag(AbstractEffect):
-    """A bundle of cables past two joints: each pulls on one as the other turns.
+    """A bundle of cables past two joints, which couples them elastically.
 
-    It is clamped before joint i and behind joint j, and bends with both. To the second order of the
-    angles its elastic energy has a term k q_i q_j + t_i q_i + t_j q_j, so that what joint j does to
-    joint i, joint i does to joint j. What it does to each alone is a `Spring`.
+    It is clamped before joint i and behind joint j, and bends with both. To second order in the
+    angles its elastic energy has a term k q_i q_j + t_i q_i + t_j q_j, so that the coupling is
+    symmetric in i and j. Its effect on each joint alone is a `Spring`.
 
     **Arguments:**
 
-    - `joint`: the first that it passes, i. `following`: the second, j.
+    - `joint`: the first joint that it passes, i. `following`: the second, j.
     - `shared`: k, N·m/rad. `preload`, `other_preload`: t_i and t_j, N·m.
     """
 
@@ -34,7 +34,7 @@ class CableDrag(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["CableDrag"]:
-        """Neighbours that turn, of arms in space."""
+        """Each pair of neighbouring turning joints, for arms in space."""
         if scene.planar:
             return []
         turning = [not slides for slides in scene.slides]
@@ -42,7 +42,7 @@ class CableDrag(AbstractEffect):
         return [cls(joint=j, following=j + 1) for j in pairs]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
-        """What the bundle asks of both joints, `(joints,)`."""
+        """Torque that the bundle requires of both joints, `(joints,)`."""
         i, j = self.joint - 1, self.following - 1
         first = self.shared * motion.q[j] + self.preload
         second = self.shared * motion.q[i] + self.other_preload

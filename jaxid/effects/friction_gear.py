@@ -1,4 +1,4 @@
-"""Friction in a gear that is loaded from both of its sides."""
+"""Friction in a gear that is loaded from both sides."""
 
 from collections.abc import Iterable
 
@@ -13,16 +13,16 @@ from .friction import smoothing_speed
 
 
 class GearFriction(AbstractEffect):
-    """Friction by load: (|Km tau + Ke load| + S (Fs + |Kms tau + Kes load|)) sigma(v).
+    """Load-dependent friction: (|Km tau + Ke load| + S (Fs + |Kms tau + Kes load|)) sigma(v).
 
-    With S = exp(-|v/vs|^power), tau the torque that other friction leaves of the drive's, and load
-    what the links take without accelerating, gravity for instance (Duclusaud, Passault, Padois, Ly
-    2025, whose tau_e is -load). Unlike `LoadDependentFriction` it is there in a gear that is
-    driven back by its load while the drive gives nothing.
+    S = exp(-|v/vs|^power), tau is the torque of the drive less other friction, and load is the
+    torque that the links need without accelerating, gravity for instance (Duclusaud, Passault,
+    Padois, Ly 2025, whose tau_e is -load). Unlike `LoadDependentFriction`, it also acts in a gear
+    that is driven back by its load while the drive gives no torque.
 
     **Fields:**
 
-    - `drive`, `back`: Km and Ke; `back` None for one ratio of both.
+    - `drive`, `back`: Km and Ke; `back` is None if one ratio holds for both.
     - `slow`, `slow_back`, `level`: Kms, Kes (None for Kms) and Fs.
     - `velocity`, `power`: of S; `velocity` None for friction without S, whose fields are not used.
     """
@@ -50,7 +50,7 @@ class GearFriction(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["GearFriction"]:
-        """Every joint, with one ratio of both sides and no peak."""
+        """Every joint, with one ratio for both sides and no peak."""
         return [cls(joint=j, smoothing=scene.smoothed(j)) for j in scene.joints]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
@@ -64,7 +64,7 @@ class GearFriction(AbstractEffect):
 
         level = of(self.drive, self.back)
         if self.velocity is not None:
-            # Away from zero, where a power below one has no slope.
+            # Kept away from zero, where a power below one has no finite slope.
             speed = jnp.sqrt(v**2 + 1e-12) / self.velocity
             peak = 0.0 if self.level is None else self.level
             peak = peak if self.slow is None else peak + of(self.slow, self.slow_back)

@@ -1,4 +1,4 @@
-"""What weighs on an arm in space: a base that is not level, and a body that its tip carries."""
+"""Gravity and inertia loads of an arm in space: a tilted base, and a body carried at the tip."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -18,30 +18,32 @@ MASS = BODY.index("M")
 
 
 class BaseTilt(AbstractEffect):
-    """A base that is not level: gravity leans to the sides of where it was drawn.
+    """A base that is not level: gravity is tilted from its direction in the model.
 
-    Its size is known, so that two slopes say all: along g + |g| (x e1 + y e2), with e1 and e2
-    across g. For a base that was drawn upright, e1 is its x axis and e2 its y axis. Each link
-    weighs on the joints before it by its mass and first moment (Khalil, Dombre 2002).
+    Its magnitude is known, so two slopes determine it: its direction is g + |g| (x e1 + y e2), with
+    e1 and e2 perpendicular to g. For a base modelled upright, e1 is its x axis and e2 its y axis.
+    The weight of each link loads the joints before it by its mass and first moment (Khalil, Dombre
+    2002).
 
     **Arguments:**
 
-    - `chain`: joints of the arm, with gravity as drawn.
-    - `bodies`: `BODY` of each link, SI units, `(joints, 10)`. They are not estimated: where the
-      arm's base parameters are, the links weigh here what they weighed when the effect was made.
-    - `x`, `y`: tangents of the angles by which gravity leans; None for one that no torque shows.
+    - `chain`: joints of the arm, with gravity as modelled.
+    - `bodies`: `BODY` of each link, SI units, `(joints, 10)`. They are not estimated: if the arm's
+      base parameters are, the links here keep the values they had when the effect was made.
+    - `x`, `y`: tangents of the angles by which gravity is tilted; None for one that affects no
+      torque.
     """
 
     chain: Chain = eqx.field(metadata=KNOWN)
     bodies: Float[Array, "joints 10"] = eqx.field(converter=as_float64)
-    # Up to the square of the angle torque is linear in them.
+    # Torque is linear in them up to terms of second order in the angle.
     x: Scalar | None = parameter(0.0, symbol="tiltx", unit="1", scale=0.02)
     y: Scalar | None = parameter(0.0, symbol="tilty", unit="1", scale=0.02)
     on_link = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["BaseTilt"]:
-        """One, for arms in space that weigh anything, with the slopes that their torque shows."""
+        """One, for arms in space that gravity loads, with the slopes that affect their torque."""
         if scene.space is None or not np.any(scene.space.chain.gravity):
             return []
         made = cls(scene.space.chain, scene.space.bodies)
@@ -58,11 +60,11 @@ class BaseTilt(AbstractEffect):
         return [dataclasses.replace(made, **{"yx"[largest]: None})]
 
     def gravity(self) -> Float[Array, "3"]:
-        """As it is, in the base's frame, m/s²."""
+        """The tilted gravity in the base's frame, m/s²."""
         drawn = self.chain.gravity
         size = jnp.sqrt(drawn @ drawn)
         down = drawn / size
-        # Across gravity: the base's x axis, or its z axis where gravity is along x.
+        # Perpendicular to gravity: from the base's x axis, or its z axis if gravity is along x.
         axis = jnp.where(jnp.abs(down[0]) < 0.9, jnp.eye(3)[0], jnp.eye(3)[2])
         first = axis - (axis @ down) * down
         first = first / jnp.sqrt(first @ first)
@@ -72,7 +74,7 @@ class BaseTilt(AbstractEffect):
         return size * leaning / jnp.sqrt(leaning @ leaning)
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
-        """What the links weigh more than on a level base, `(joints,)`."""
+        """Torque of the links' weight beyond that on a level base, `(joints,)`."""
         change = dataclasses.replace(self.chain, gravity=self.gravity() - self.chain.gravity)
         rest = jnp.zeros_like(motion.v)
         return change.inverse(self.bodies, motion.q, rest, rest)
@@ -80,7 +82,7 @@ class BaseTilt(AbstractEffect):
 
 @eqx.filter_jit
 def _slopes(effect: BaseTilt, q: Float[Array, "poses joints"]) -> Float[Array, "rows two"]:
-    """Torque by both slopes at poses at rest, one row for each joint."""
+    """Derivative of torque by both slopes at poses at rest, one row for each joint."""
     rest, none = jnp.zeros_like(q[0]), jnp.zeros(0)
 
     def torque(slopes: Float[Array, " two"], at: Float[Array, " joints"]):
@@ -94,17 +96,17 @@ def _slopes(effect: BaseTilt, q: Float[Array, "poses joints"]) -> Float[Array, "
 class CarriedBody(AbstractEffect):
     """A body at the tip of an arm in space, on all or on named recordings.
 
-    Torque is linear in its ten parameters about the tip (Khalil, Dombre 2002). On all recordings it
-    is a part of the last link, and shows only where that is held.
+    Torque is linear in its ten parameters about the tip (Khalil, Dombre 2002). If it is on all
+    recordings, it can be identified only if the parameters of the last link are held.
 
     **Arguments:**
 
     - `chain`: joints of the arm, and its tip.
     - `mass`: kg. `rest`: its other parameters about the tip, along the axes of the last link's
       frame, kg·m² and kg·m, in the order of `shown`.
-    - `recordings`: names of those that have it; all where none is named.
-    - `shown`: places of `rest` in `BODY`; an arm of few joints does not show all, and the others
-      are nil.
+    - `recordings`: names of the recordings that have it; all if none is named.
+    - `shown`: indices of `rest` in `BODY`; an arm of few joints does not identify all, and the
+      others are zero.
     """
 
     chain: Chain = eqx.field(metadata=KNOWN)
@@ -117,12 +119,12 @@ class CarriedBody(AbstractEffect):
 
     @classmethod
     def effect_name(cls) -> str:
-        """A payload, of which it is the form in space."""
+        """The name of a payload, of which this is the form for arms in space."""
         return "payload"
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["CarriedBody"]:
-        """Each of several recordings in turn; and all at once where the last link is held."""
+        """Each of several recordings in turn, and all together if the last link is held."""
         if scene.space is None or MASS not in scene.space.carried:
             return []
         named = [(name,) for name in scene.recordings] if len(scene.recordings) > 1 else []
@@ -134,20 +136,20 @@ class CarriedBody(AbstractEffect):
 
     @property
     def rest_names(self) -> tuple[str, ...]:
-        """What the other parameters are called, and on which recordings."""
+        """Names of the other parameters, with their recordings."""
         where = f"({','.join(self.recordings)})" if self.recordings else ""
         return tuple(f"payload_{BODY[k]}{where}" for k in self.shown)
 
     def about_tip(self) -> Float[Array, "10"]:
-        """Its `BODY` about the tip, SI units."""
+        """Its parameters in the order of `BODY` about the tip, SI units."""
         return jnp.zeros(10).at[jnp.asarray(self.shown, int)].set(self.rest).at[MASS].set(self.mass)
 
     def centre(self) -> Float[Array, "3"]:
-        """Where its centre of mass is, in the last link's frame, m."""
+        """Position of its centre of mass in the last link's frame, m."""
         return self.chain.tip + self.about_tip()[6:9] / self.mass
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
-        """What it takes to carry the body along, `(joints,)`."""
+        """Torque needed to move the body, `(joints,)`."""
         last = moved_body(self.about_tip(), self.chain.tip)
         bodies = jnp.zeros((self.chain.joints, 10)).at[-1].set(last)
         asked = self.chain.inverse(bodies, motion.q, motion.v, motion.a)

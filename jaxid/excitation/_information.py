@@ -1,4 +1,4 @@
-"""What a reference would tell about the parameters: information matrices, differentiable."""
+"""Differentiable information matrices of the parameters along a reference."""
 
 from typing import Literal
 
@@ -38,7 +38,7 @@ def along(
 def torque_along(
     loop: ClosedLoop, time: Float[Array, " points"], signals: Float[Array, "3 points joints"]
 ) -> Float[Array, "points joints"]:
-    """Torque that is to be commanded for a motion; drives that lag are taken to follow at once."""
+    """Torque to command for a motion; drives that lag are assumed to follow immediately."""
     acting = [type(e).command is not AbstractEffect.command for e in loop.effects]
     lags = [on and e.initial_state().size for e, on in zip(loop.effects, acting, strict=True)]
     prompt = [e for e, late in zip(loop.effects, lags, strict=True) if not late]
@@ -50,8 +50,8 @@ def torque_along(
     tau = jnp.zeros_like(signals[0])
     if all(type(e).command is AbstractEffect.command and not e.loaded for e in prompt):
         return lacking(tau)
-    # What drives do with a command, and friction that grows with it, are all but affine in it:
-    # a few steps of Newton's method.
+    # The delivered torque and friction that grows with it are almost affine in the command, so a
+    # few steps of Newton's method suffice.
     for _ in range(4):
         missing, slope = jax.jvp(lacking, (tau,), (jnp.ones_like(tau),))
         tau = tau - missing / jnp.minimum(slope, -0.1)
@@ -59,7 +59,7 @@ def torque_along(
 
 
 def chosen_parameters(loop: ClosedLoop, kind: Kind) -> tuple[Parameter, ...]:
-    """Which parameters are to be determined: with inverse dynamics, those that are linear."""
+    """The parameters to determine; with inverse dynamics, those in which torque is linear."""
     return linear_parameters(loop) if kind == "inverse-dynamics" else loop.free_parameters
 
 
@@ -67,7 +67,7 @@ def chosen_parameters(loop: ClosedLoop, kind: Kind) -> tuple[Parameter, ...]:
 def inverse_columns(
     loop: ClosedLoop, time: Float[Array, " points"], signals: Float[Array, "3 points joints"]
 ) -> Float[Array, "points joints parameters"]:
-    """The inverse-dynamics regressor along a motion and the torque that it takes."""
+    """The inverse-dynamics regressor along a motion, and the torque that the motion needs."""
     chosen = linear_parameters(loop)
     at = along(time, signals, torque_along(loop, time, signals))
 
@@ -82,7 +82,7 @@ def intervals_of(
     time: Float[Array | np.ndarray, " points"],
     signals: Float[Array, "3 points joints"],
 ) -> Interval:
-    """A reference as the simulation takes it: cubics that meet positions and velocities."""
+    """A reference in the simulation's form: cubics that match positions and velocities."""
     q, v, _ = signals
     h = jnp.append(jnp.diff(jnp.asarray(time)), 0.0)
     safe = jnp.where(h > 0, h, 1.0)[:, None]
@@ -91,7 +91,7 @@ def intervals_of(
     second = (3 * move - 2 * v - then) / safe
     third = (v + then - 2 * move) / safe**2
     n, joints = q.shape
-    # A sampled law ticks at every point of the grid but the last.
+    # A sampled law ticks at every point of the grid except the last.
     ticks = jnp.arange(n) < n - 1
     return jax.vmap(Interval)(
         jnp.asarray(time),
@@ -132,7 +132,7 @@ def closed_loop_columns(
 def information_of(
     columns: Float[Array, "points joints parameters"], noise: Float[Array, " joints"]
 ) -> Float[Array, "parameters parameters"]:
-    """Information of white torque noise of these deviations, `(joints,)`."""
+    """Information matrix for white torque noise of these deviations, `(joints,)`."""
     scaled = columns / noise[:, None]
     return jnp.einsum("kjp,kjq->pq", scaled, scaled)
 
@@ -145,7 +145,8 @@ def _by_size(
     scaled = information * jnp.outer(scales, scales)
     size = jnp.sqrt(jnp.diag(scaled))
     size = jnp.where(size > 0, size, 1.0)
-    # What cannot be told apart has no deviation; a floor at rounding keeps the search going.
+    # Parameters that are not identifiable have no deviation; a floor near rounding error keeps the
+    # search going.
     return scaled / jnp.outer(size, size) + 1e-13 * jnp.eye(p), size
 
 
@@ -176,7 +177,7 @@ def log_condition(
 
 
 class Settings(eqx.Module):
-    """How references are judged: which information, which criterion, how much noise."""
+    """How references are scored: the kind of information, the criterion, and the noise."""
 
     kind: Kind = eqx.field(static=True)
     criterion: Criterion = eqx.field(static=True)
@@ -187,6 +188,6 @@ class Settings(eqx.Module):
         check_words(self)
 
     def judge(self, information: Float[Array, "parameters parameters"]) -> Float[Array, ""]:
-        """The criterion, to be made small."""
+        """The criterion, to be minimised."""
         by = {"determinant": log_volume, "deviation": log_deviation, "condition": log_condition}
         return by[self.criterion](information, jnp.asarray(self.scales))

@@ -1,4 +1,4 @@
-"""From random references to good ones: a descent within the limits."""
+"""Constrained descent from random references within the limits."""
 
 from collections.abc import Callable
 
@@ -13,10 +13,10 @@ from ._information import closed_loop_columns, torque_along
 from .design import SLACK, Design, feasible_share, margins_and_slopes, score_and_slope, score_of
 from .limits import margins_along
 
-# The grid on which a result is checked is so many times as fine.
+# Factor by which the grid on which a result is checked is finer.
 _FINER = 10
 
-# How often points that a descent has overlooked are imposed before the step is shortened.
+# Number of times that violated points are added to the constraints before the step is shortened.
 _EXCHANGES = 4
 
 
@@ -26,17 +26,17 @@ def random_references(
     count: int,
     seed: int = 0,
 ) -> tuple[Float[np.ndarray, "count numbers"], Float[np.ndarray, " count"]]:
-    """Random references as large as the limits let them be, and their scores.
+    """Random references as large as the limits allow, and their scores.
 
     **Arguments:**
 
-    - `centre`: free numbers of the pose they grow from.
+    - `centre`: free numbers of the pose from which they are scaled.
     """
     rng = np.random.default_rng(seed)
     joints = design.base.shape[1]
     span = (design.limits.high - design.limits.low) / 2
     drawn = rng.normal(size=(count, *design.shape)) * span
-    # Each joint as large as its own size lets it be, in proportions of its own.
+    # Each joint moves in proportion to its range of position, times a random factor of its own.
     drawn *= rng.uniform(0.3, 1.5, (count, 1, joints))
     drawn = centre + drawn.reshape(count, -1)
     shares = jax.lax.map(
@@ -48,14 +48,14 @@ def random_references(
 
 
 def _dips(margins: Float[np.ndarray, "points kinds"]) -> np.ndarray:
-    """Where each limit comes nearest, and the points beside; bool, (points, kinds)."""
+    """Points nearest to each limit, and their neighbours; bool, (points, kinds)."""
     before, after = np.roll(margins, 1, axis=0), np.roll(margins, -1, axis=0)
     nearest = (margins <= before) & (margins <= after)
     return nearest | np.roll(nearest, 1, axis=0) | np.roll(nearest, -1, axis=0)
 
 
 def _active(margins: Float[np.ndarray, "points kinds"], reach: float) -> np.ndarray:
-    """Where limits may soon bind; bool, (points, kinds)."""
+    """Points where limits may become active; bool, (points, kinds)."""
     coarse = np.zeros_like(margins, bool)
     coarse[::8] = True
     return (margins < 1.5 * reach) & (_dips(margins) | coarse)
@@ -70,8 +70,8 @@ def improved(
 ) -> Float[np.ndarray, " numbers"]:
     """Constrained descent: SLSQP within a trust region, on the points where limits are near.
 
-    After each round the points are chosen anew, and the reference is drawn in until it keeps the
-    limits everywhere: the best that does is what counts.
+    After each round the points are chosen again, and the reference is shrunk until it keeps the
+    limits everywhere. The best of these references is the result.
     """
     best, best_score = z, float(score_of(design, jnp.asarray(z)))
     reach = 0.5
@@ -99,8 +99,8 @@ def _descend(
 ) -> Float[np.ndarray, " numbers"]:
     """SLSQP from a reference that keeps all limits, within a box around it.
 
-    Where what it finds passes a limit at a point that was not imposed, that is imposed too, and
-    the descent goes on from there (exchange method, Hettich and Kortanek 1993).
+    If the result violates a limit at a point that was not imposed, that point is imposed too, and
+    the descent continues (exchange method, Hettich and Kortanek 1993).
     """
     low, high, found = z - box, z + box, z
     imposed = _active(_margins_at(design, z), reach)
@@ -156,7 +156,7 @@ def _descend_on(
 def shrunk(
     design: Design, z: Float[np.ndarray, " numbers"], centre: Float[np.ndarray, " numbers"]
 ) -> Float[np.ndarray, " numbers"]:
-    """The reference, drawn in towards a pose where need be until every limit holds in between."""
+    """The reference, shrunk towards a pose if needed until limits hold between grid points too."""
     share = 1.0
     for _ in range(60):
         at = centre + share * (z - centre)
@@ -178,7 +178,7 @@ def all_margins(
     tau = torque_along(design.loop, jnp.asarray(time), signals)
     rows, inside = margins_along(design.limits, signals, tau)
     smallest = np.concatenate([np.asarray(rows).min(axis=0).ravel(), np.asarray(inside).min(0)])
-    # Between the points of a fine grid a series of so many harmonics rises by no more than this
+    # Upper bound on how far a series of this many harmonics rises between points of the fine grid
     # (Ehlich and Zeller 1964).
     smallest = smallest - (1 / np.cos(np.pi * harmonics / count) - 1)
     if design.settings.kind != "closed-loop":

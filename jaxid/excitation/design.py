@@ -27,12 +27,12 @@ from ._information import (
 )
 from .limits import SIDES, Limits, margins_along
 
-# Limits are kept this far from, on the grid where they are imposed.
+# Distance kept from the limits on the grid where they are imposed.
 SLACK = 1e-3
 
 
 class Design(eqx.Module):
-    """The search space of references: series of some harmonics that start and end at rest.
+    """The search space of references: finite Fourier series that start and end at rest.
 
     Coefficients are `base + span @ z` for free numbers z, `(numbers, joints)`.
     """
@@ -51,13 +51,13 @@ class Design(eqx.Module):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Of z: free numbers a joint, joints."""
+        """Shape of z: free numbers per joint, joints."""
         return self.span.shape[1], self.base.shape[1]
 
     def coefficients(
         self, z: Float[Array | np.ndarray, " numbers"]
     ) -> Float[Array | np.ndarray, "coefficients joints"]:
-        """The series of free numbers, flat."""
+        """The series of coefficients for flat free numbers."""
         return self.base + self.span @ z.reshape(self.shape)
 
 
@@ -77,7 +77,7 @@ def margins_and_slopes(design: Design, z: Float[Array, " numbers"]) -> tuple[Arr
 def feasible_share(
     design: Design, z: Float[Array, " numbers"], centre: Float[Array, " numbers"]
 ) -> Float[Array, ""]:
-    """The largest share of the way from a pose to a reference at which all limits hold."""
+    """The largest fraction of the way from a pose to a reference at which all limits hold."""
 
     def good(share):
         return jnp.min(_margins(design, centre + share * (z - centre))) >= SLACK
@@ -89,7 +89,7 @@ def feasible_share(
         return jnp.where(fits, middle, low), jnp.where(fits, high, middle)
 
     found = jax.lax.fori_loop(0, 20, body, (jnp.zeros(()), jnp.ones(())))[0]
-    # A smaller motion may pass a limit that a larger one keeps.
+    # A smaller motion may violate a limit that a larger one keeps.
     return jnp.where(good(1.0), 1.0, found)
 
 
@@ -155,7 +155,7 @@ def _check(
 def _static_margins(
     loop: ClosedLoop, limits: Limits, poses: Float[np.ndarray, "poses joints"]
 ) -> Float[np.ndarray, "poses kinds"]:
-    """How far poses at rest are from every limit."""
+    """Margins of poses at rest to every limit."""
 
     def one(q):
         signals = jnp.stack([q, jnp.zeros_like(q), jnp.zeros_like(q)])[:, None]
@@ -169,9 +169,9 @@ def _static_margins(
 def pose_within(
     loop: ClosedLoop, limits: Limits, start: Float[np.ndarray, " joints"] | None
 ) -> Float[np.ndarray, " joints"]:
-    """A pose at which the arm can stand still inside all limits, `(joints,)`.
+    """A pose at which the arm can stand still within all limits, `(joints,)`.
 
-    **Raises:** `LimitsError` that names the limit which leaves none.
+    **Raises:** `LimitsError` that names the limit that allows none.
     """
     if start is not None:
         poses = np.asarray(start, float).reshape(1, -1)
@@ -205,7 +205,7 @@ def pose_within(
 
 
 def _grid(joints: int) -> Float[np.ndarray, "points joints"]:
-    """Points that fill the unit cube, its middle first."""
+    """Points that fill the unit cube, its centre first."""
     import scipy
 
     middle = np.full((1, joints), 0.5)
@@ -239,7 +239,7 @@ def make_design(
     pose = pose_within(loop, limits, None if start is None else np.asarray(start, float))
     at_start = fourier_basis(np.zeros(1), period, harmonics)[:, 0]
     rest = at_start[1:] if start is None else at_start
-    # High harmonics are small: their speed and acceleration grow with their number.
+    # High harmonics start small, since their speed and acceleration grow with the harmonic number.
     own = 1 / np.concatenate([[1.0], np.repeat(np.arange(1, harmonics + 1), 2)]) ** 1.5
     span = own[:, None] * scipy.linalg.null_space(rest * own)
     base = np.zeros((2 * harmonics + 1, loop.joints))
@@ -249,7 +249,7 @@ def make_design(
         base = level
     centre = np.linalg.lstsq(span, level - base, rcond=None)[0].ravel()
     n = round(period * rate)
-    # Sums over a period hardly change with more samples than these.
+    # With more samples than these, sums over a period hardly change.
     few = n if kind == "closed-loop" else min(n, 24 * harmonics)
     samples = np.arange(few + (kind == "closed-loop")) * period / few
     points = np.arange(64 * harmonics) * period / (64 * harmonics)

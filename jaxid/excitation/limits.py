@@ -1,4 +1,4 @@
-"""What a reference and its motion may not exceed."""
+"""Limits of a reference and its motion."""
 
 from collections.abc import Callable, Iterable
 
@@ -18,7 +18,7 @@ def _vector(value: object) -> Float[np.ndarray, " joints"]:
 
 
 class Limits(eqx.Module):
-    """What a reference and its motion may not exceed, one value a joint, in SI units.
+    """Limits of a reference and its motion, one value per joint, in SI units.
 
     **Arguments:**
 
@@ -26,7 +26,7 @@ class Limits(eqx.Module):
     - `workspace`: a function of a position, `(joints,)`, whose values must all be positive; for
       instance a `PlanarReach`. None for no such limit.
 
-    **Raises:** `LimitsError` where they contradict each other.
+    **Raises:** `LimitsError` if they contradict each other.
     """
 
     low: Float[np.ndarray, " joints"] = eqx.field(converter=_vector)
@@ -57,9 +57,9 @@ class Limits(eqx.Module):
 
     @classmethod
     def of(cls, recordings: Iterable[Recording]) -> "Limits":
-        """What recordings have reached: positions and torques measured, rates as asked for.
+        """Limits that recordings reached: measured positions and torques, rates of the reference.
 
-        Where nothing was asked for, rates are those of the measured positions, low-passed.
+        Without a reference, rates are those of the low-passed measured positions.
         """
         rows = list(recordings)
         speed, acceleration = [], []
@@ -82,7 +82,7 @@ class Limits(eqx.Module):
 class PlanarReach(eqx.Module):
     """Keeps the tip of turning links in a plane inside a box.
 
-    x points along the stretched arm at q = 0 (down, for an arm that hangs), y a quarter turn on.
+    x points along the stretched arm at q = 0 (down, for a hanging arm), y a quarter turn further.
 
     **Arguments:**
 
@@ -117,7 +117,7 @@ def margins_along(
     signals: Float[Array, "3 points joints"],
     tau: Float[Array, "points joints"],
 ) -> tuple[Float[Array, "points 8 joints"], Float[Array, "points sides"]]:
-    """How far a motion is from each limit, as a share of it; negative where it is passed."""
+    """Margin of a motion to each limit, as a fraction of it; negative if it is violated."""
     q, v, a = signals
     span = limits.high - limits.low
     rates = [(v, limits.speed), (a, limits.acceleration), (tau, limits.torque)]

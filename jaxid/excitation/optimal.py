@@ -45,29 +45,30 @@ def optimal_excitation(
     seed: int = 0,
     say: Callable[[str], None] = lambda text: None,
 ) -> Excitation:
-    """Finds the reference from which the parameters are determined best.
+    """Finds the reference that determines the parameters best.
 
-    A finite Fourier series a joint that starts and ends at rest (Swevers et al. 1997), by exact
-    gradients: SLSQP from the best of random references. Limits are imposed where they are nearest,
-    again and again, and checked on a grid ten times as fine.
+    Each joint follows a finite Fourier series that starts and ends at rest (Swevers et al. 1997).
+    SLSQP with exact gradients starts from the best of random references. Limits are repeatedly
+    imposed where they are nearest, and checked on a grid ten times as fine.
 
     **Arguments:**
 
-    - `loop`: the model at the best values known; its free parameters are to be determined.
-    - `limits`: that the reference and the torque it takes keep.
-    - `period`: s. `harmonics`: how many. `rate`: at which it will be sampled, Hz.
+    - `loop`: the model at the best known values; its free parameters are to be determined.
+    - `limits`: of the reference and of the torque that it needs.
+    - `period`: s. `harmonics`: their number. `rate`: sample rate, Hz.
     - `kind`: `"inverse-dynamics"` for regressions, `"closed-loop"` for `OEM`: the sensitivities of
       the simulated loop, whose motion and torque must then keep the limits too.
-    - `criterion`: what is made small: `"determinant"` (of the covariance), `"deviation"` (geometric
+    - `criterion`: what is minimised: `"determinant"` (of the covariance), `"deviation"` (geometric
       mean of the standard deviations) or `"condition"` (of the columns).
-    - `noise`: deviation of torque noise, one or one a joint, N·m or N; a hundredth of the limits
-      where None.
-    - `start`: pose to start and end at, `(joints,)`; any where None.
-    - `tries`: random references. `starts`: how many of the best are improved. `rounds`: at most.
-    - `seed`: of the random references. `say`: told how it goes.
+    - `noise`: deviation of torque noise, one or one per joint, N·m or N; a hundredth of the limits
+      if None.
+    - `start`: pose to start and end at, `(joints,)`; any if None.
+    - `tries`: number of random references. `starts`: number of the best that are improved.
+      `rounds`: largest number of rounds.
+    - `seed`: of the random references. `say`: called with progress.
 
-    **Raises:** `LimitsError` that names the limit which leaves no motion; `FitError` for settings
-        that make no reference.
+    **Raises:** `LimitsError` that names the limit that allows no motion; `FitError` for settings
+        that allow no reference.
     """
     design, centre = make_design(
         loop,
@@ -131,7 +132,7 @@ def _margin_table(design: Design, smallest: Float[np.ndarray, " kinds"]) -> "pd.
         table[kind] = np.minimum(table[kind], row) if kind in table else row
     frame = pd.DataFrame(table, index=[f"joint {j}" for j in range(1, joints + 1)]).T * 100
     if len(smallest) > 8 * joints:
-        # A function that a user gave, in whatever unit.
+        # A function given by the user, in an unknown unit.
         frame.loc["workspace, in its unit"] = np.nan
         frame.iloc[-1, 0] = smallest[8 * joints :].min()
     return frame.rename_axis("limit")

@@ -1,4 +1,4 @@
-"""An excitation: a reference that determines the parameters, and how well it will."""
+"""An excitation: a reference that determines the parameters, with its predicted accuracy."""
 
 import html
 from typing import TYPE_CHECKING
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 
 
 class Excitation(AbstractShown):
-    """A reference that determines the parameters, and how well it will.
+    """A reference that determines the parameters, with its predicted accuracy.
 
     - `series`: the reference as a Fourier series; `reference()` samples it.
-    - `std`: predicted standard deviations of the parameters `names`, for one period and the torque
-      noise that was assumed.
-    - `margins`: by limit and joint, how much of it is left, in percent; of the workspace what
-      its function leaves, as a rule m; none is negative.
-    - `score`: logarithm of the criterion, parameters in units of their scales; of the determinant
-      the root that makes it a deviation.
+    - `std`: predicted standard deviations of the parameters `names`, for one period and the assumed
+      torque noise.
+    - `margins`: remaining margin by limit and joint, in percent; for the workspace the value of
+      its function, usually in m; none is negative.
+    - `score`: logarithm of the criterion, with parameters in units of their scales; for the
+      determinant, of the root that makes it a deviation.
     """
 
     loop: ClosedLoop
@@ -49,11 +49,11 @@ class Excitation(AbstractShown):
         return np.sqrt(np.diag(self.covariance))
 
     def reference(self, periods: int = 1, rate: float | None = None) -> Recording:
-        """The reference sampled, with the torque it takes as `tau`.
+        """The reference sampled, with the torque that it needs as `tau`.
 
         **Arguments:**
 
-        - `periods`: how often it is run through. `rate`: Hz; by default as it was designed for.
+        - `periods`: number of repetitions. `rate`: Hz; by default the rate of the design.
         """
         rate = rate or self.rate
         time = np.arange(round(periods * self.series.period * rate) + 1) / rate
@@ -110,7 +110,7 @@ class Excitation(AbstractShown):
 def margins_on(
     excitation: Excitation, time: Float[np.ndarray, " points"]
 ) -> Float[np.ndarray, "points kinds"]:
-    """How far a reference is from each limit at times, s, as a share of it."""
+    """Margin of a reference to each limit at times, s, as a fraction of it."""
     signals = jnp.asarray(excitation.series(time))
     tau = torque_along(excitation.loop, jnp.asarray(time), signals)
     rows, inside = margins_along(excitation.limits, signals, tau)

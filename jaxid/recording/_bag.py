@@ -1,4 +1,4 @@
-"""Bags of ROS 2: messages about joints, as streams by topic, field and joint."""
+"""ROS 2 bags: messages about joints, as streams by topic, field and joint."""
 
 import os
 import warnings
@@ -17,7 +17,7 @@ from ._table import Table
 
 
 class _Topic(eqx.Module):
-    """Messages of one topic as they come: stamp, and by field the joints' names and values."""
+    """Messages of one topic in order of arrival: stamp, and joint names and values by field."""
 
     kind: Kind = eqx.field(static=True)
     stamps: list[int] = eqx.field(default_factory=list)
@@ -26,7 +26,7 @@ class _Topic(eqx.Module):
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag of ROS 2: a folder of one, or one of its files."""
+    """Whether a path is a ROS 2 bag: its folder, or one of its files."""
     if path.is_dir():
         return any(f.name == "metadata.yaml" or _is_storage(f) for f in path.iterdir())
     return _is_storage(path)
@@ -86,7 +86,7 @@ def _messages(
     topics = {c.topic: _Topic(known[c.msgtype]) for c in wanted}
     readable = _typestore(source, wanted)
     size = 0
-    # Without connections a reader gives the messages of all of them.
+    # Without connections a reader returns the messages of all connections.
     for connection, received, data in bag.messages(wanted) if wanted else ():
         size += len(data)
         if size > largest:
@@ -110,7 +110,7 @@ def _messages(
 
 
 def _typestore(source: str, connections: list[Any]) -> Callable[[bytes, str], Any]:
-    """What reads messages: by the definitions in the bag, or those of ROS itself."""
+    """The deserialiser of messages, by the definitions in the bag or those of ROS."""
     typesys = require("rosbags.typesys", "ros")
     formats = require("rosbags.interfaces", "ros").MessageDefinitionFormat
     common = typesys.get_typestore(typesys.Stores.LATEST)
@@ -165,7 +165,7 @@ def _streams(source: str, name: str, topic: _Topic) -> dict[str, Stream]:
             parts.setdefault(f"{name}/{field}/{joint}", []).append((np.array(chosen), column))
     streams = {}
     for column, several in parts.items():
-        # Messages with other orders of joints came between these.
+        # Messages with other joint orders came between these.
         order = np.concatenate([chosen for chosen, _ in several])
         values = np.concatenate([value for _, value in several])
         sort = np.argsort(order, kind="stable")
@@ -189,7 +189,7 @@ def _stamps(source: str, name: str, topic: _Topic) -> np.ndarray:
 
 
 def _once(source: str, name: str, topic: _Topic, stamps: np.ndarray) -> list[int]:
-    """Rows of the messages, those apart that are there a second time."""
+    """Rows of the messages without duplicates."""
     seen: dict[int, int] = {}
     once = []
     for row, stamp in enumerate(stamps.tolist()):
@@ -233,7 +233,7 @@ def _about(name: str, topic: _Topic, streams: dict[str, Stream]) -> str:
 def _defaults(
     topics: dict[str, _Topic], columns: dict[str, Stream]
 ) -> tuple[dict[str, dict[str, str]], dict[str, str]]:
-    """Columns by signal and joint, and what to say of signals that several topics could be."""
+    """Columns by signal and joint, and notes on signals that several topics could supply."""
     defaults, unclear = {}, {}
     for signal in ("q", "tau", "q_ref", "v"):
         found: dict[str, str] = {}
@@ -253,7 +253,7 @@ def _defaults(
 def _offers(
     signal: str, topics: dict[str, _Topic], columns: dict[str, Stream]
 ) -> Iterator[tuple[str, dict[str, str]]]:
-    """Topics that offer a signal, of the first kind of which there is one, columns by joint."""
+    """Topics that offer a signal, of the first kind that has any, with columns by joint."""
     for kind in kinds().values():
         offered = []
         for name in sorted(n for n, topic in topics.items() if topic.kind.fields is kind.fields):
@@ -269,6 +269,6 @@ def _offers(
 
 
 def bag_name(path: str | os.PathLike[str]) -> str:
-    """What a recording from a bag is called: the folder or the file, without its ending."""
+    """Name of a recording from a bag: that of the folder or the file, without extension."""
     given = Path(path)
     return given.name if given.is_dir() else given.stem

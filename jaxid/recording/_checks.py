@@ -20,8 +20,8 @@ Lines = Sequence[int]
 
 _FEWEST_SAMPLES = 20
 _LARGEST = 1e30
-# Smallest jitter of times, in steps, that is examined, and how much smoother the motion must be on
-# even times for a warning.
+# Smallest jitter of times, in steps, that is examined, and the factor by which the motion must be
+# smoother on even times for a warning.
 _JITTER, _ROUGHER = 0.05, 2.0
 
 
@@ -57,7 +57,7 @@ def numeric(
     - `source`: the file or recording they come from.
     - `column`: their name there.
     - `values`: array-like; a missing value becomes NaN.
-    - `lines`: of its rows in a text file.
+    - `lines`: line numbers of its rows in a text file.
 
     **Raises:** `RecordingError` for text, objects, booleans, dates, complex or ragged values.
     """
@@ -84,7 +84,7 @@ def numeric(
 
 
 def _are_lists(array: np.ndarray) -> bool:
-    """Whether the cells of a column are lists, of one value for each joint."""
+    """Whether the cells of a column are lists with one value per joint."""
     return len(array) > 0 and all(isinstance(cell, list | tuple | np.ndarray) for cell in array)
 
 
@@ -140,10 +140,10 @@ def validate(
 
     - `source`: the file or recording they come from.
     - `signals`: values by signal, in the units of the file; 1-d means one joint.
-    - `labels`: what the file calls the columns of each signal.
+    - `labels`: names of the columns of each signal in the file.
     - `units`, `scale`: unit and factor by signal.
     - `accept`: which faults of the file to accept.
-    - `lines`: of the rows in a text file.
+    - `lines`: line numbers of the rows in a text file.
 
     **Returns:** `time` `(samples,)` and the others `(samples, joints)`.
 
@@ -259,7 +259,7 @@ def _shapes(
     for signal in (signal for signal in SIGNALS if signal in signals and signal != "time"):
         values = signals[signal]
         if signal in HELD and not np.ndim(values):
-            # One number is that of all samples.
+            # A single number applies to all samples.
             values = np.broadcast_to(values, np.shape(shaped["q"])).copy()
         values = values[:, None] if np.ndim(values) == 1 else values
         name = brief(", ".join(labels.get(signal, (signal,))))
@@ -305,7 +305,7 @@ def _finite(
 def _bounded(
     source: str, signal: str, values: Float64[np.ndarray, "..."], labels: Labels, lines: Lines
 ) -> None:
-    """Refuses values that are not physical and whose squares overflow float64."""
+    """Refuses unphysical values whose squares overflow float64."""
     table = values.reshape(len(values), -1)
     row, joint = np.unravel_index(np.abs(table).argmax(), table.shape)
     if abs(table[row, joint]) > _LARGEST:

@@ -22,7 +22,7 @@ from ._units import HELD, SIGNALS
 class Layout(eqx.Module):
     """Column names that a published data set uses, in the form of `read(..., columns=...)`.
 
-    `quantised` says that positions which look like whole encoder counts are such.
+    `quantised` says that positions that look like whole encoder counts are encoder counts.
     """
 
     required: dict[str, str]
@@ -54,8 +54,8 @@ def known_layouts() -> tuple[Layout, ...]:
 class Picked(eqx.Module):
     """Signals found in a table, in its units, with the names they have there.
 
-    `quantised` says that positions which look like whole encoder counts are such. `lines` are the
-    line numbers of the rows in a text file.
+    `quantised` says that positions that look like whole encoder counts are encoder counts. `lines`
+    are the line numbers of the rows in a text file.
     """
 
     signals: dict[str, Float64[np.ndarray, "..."]]
@@ -71,9 +71,9 @@ def pick(source: str, table: Table, told: Description) -> Picked:
 
     - `source`: the file or recording it comes from.
     - `table`: its columns.
-    - `told`: our names to theirs; where silent, default names and known layouts hold.
+    - `told`: maps our names to theirs; by default, default names and known layouts apply.
 
-    **Raises:** `RecordingError` for a column that is missing, doubled or not numeric.
+    **Raises:** `RecordingError` for a column that is missing, duplicated or not numeric.
     """
     labels, quantised = labels_of(source, table, told)
     columns = aligned(source, table.columns, labels)
@@ -85,7 +85,7 @@ def pick(source: str, table: Table, told: Description) -> Picked:
 
 
 def labels_of(source: str, table: Table, told: Description) -> tuple[dict[str, list[str]], bool]:
-    """Columns by signal, and whether positions are whole encoder counts where they look like it.
+    """Columns by signal, and whether positions that look like whole encoder counts are counts.
 
     **Raises:** `RecordingError` for a signal that is not found.
     """
@@ -102,7 +102,7 @@ def labels_of(source: str, table: Table, told: Description) -> tuple[dict[str, l
 def _counted(
     source: str, period: Float64[np.ndarray, "..."], samples: int, name: str
 ) -> Float64[np.ndarray, " samples"]:
-    """Times from a period, where a file has no column of them."""
+    """Times from a period, if a file has no time column."""
     every = float(period.reshape(()))
     if not 0 < every < np.inf:
         raise problem(
@@ -138,7 +138,7 @@ def _resolve(
 def _default_names(source: str, table: Table, signal: str) -> list[str]:
     here = {*table.columns, *table.refused}
     if signal in HELD:
-        # A plain kp or supply is a number about the drive in many files, and no signal.
+        # A plain kp or supply is often a constant of the drive rather than a signal.
         here = {name for name in here if name.startswith(f"{signal}_")}
     stem, numbers = f"{signal}_", _numbers(f"{signal}_", here)
     # A plain v1 may be a voltage; the other names are unambiguous.
@@ -160,7 +160,7 @@ def _default_names(source: str, table: Table, signal: str) -> list[str]:
 
 
 def _numbers(stem: str, names: Collection[str]) -> set[int]:
-    """Numbers of the joints that have a column of this stem."""
+    """Numbers of the joints that have a column with this stem."""
     matches = (re.fullmatch(rf"{stem}([1-9]\d{{0,3}})", name, re.ASCII) for name in names)
     return {int(match[1]) for match in matches if match}
 
@@ -181,7 +181,7 @@ def _stack(
 ) -> Float64[np.ndarray, "..."]:
     if signal == "time":
         return _factor(source, table, signal, names[0])
-    # A gain that is the same all along is no column of its own.
+    # A constant gain may be given as a number instead of a column.
     column = _factor if signal in HELD else _column
     columns = [column(source, table, signal, name) for name in names]
     if len(columns) == 1:
@@ -217,7 +217,7 @@ def _column(source: str, table: Table, signal: str, name: str) -> Float64[np.nda
 
 
 def _factor(source: str, table: Table, signal: str, name: str) -> Float64[np.ndarray, "..."]:
-    """A factor of a product: a column, or a number as it stands."""
+    """A factor of a product: a column, or a literal number."""
     if name not in table.columns:
         with contextlib.suppress(ValueError):
             return np.asarray(float(name))

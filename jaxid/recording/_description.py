@@ -1,4 +1,4 @@
-"""What a user says of recordings: which columns, in what units, and what to put up with."""
+"""Description of recordings by the user: columns, units, and faults to accept."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,13 +14,13 @@ Resolution = float | int | Sequence[float] | np.ndarray
 
 
 class Description(eqx.Module):
-    """The arguments of `jaxid.read` that say what is in a file.
+    """The arguments of `jaxid.read` that describe the contents of a file.
 
-    - `columns`: our names to theirs.
-    - `joints`: names of joints, in the order of the robot, where columns carry them.
+    - `columns`: maps our names to theirs.
+    - `joints`: names of joints in the order of the robot, if columns are named by them.
     - `units`, `scale`: unit and factor by signal.
     - `resolution`: encoder step, rad or m.
-    - `accept`: what of the faults to put up with.
+    - `accept`: which faults to accept.
     """
 
     columns: Columns | None = None

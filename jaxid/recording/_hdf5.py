@@ -11,14 +11,14 @@ from ._table import Table
 def hdf5_table(path: Path, largest: int, refuse: Callable[[int], Exception]) -> Table:
     """Datasets of numbers in a file by path, as `robot/q`; the fields of a table as `log/q`.
 
-    Images and other arrays of more than two dimensions are named and not read, nor is what lies in
-    other files.
+    Images and other arrays of more than two dimensions are listed but not read, and neither is data
+    in other files.
 
     **Arguments:**
 
-    - `largest`: bytes that are read; `refuse` makes the error for more.
+    - `largest`: most bytes to read; `refuse` makes the error for more.
 
-    **Raises:** `MissingExtraError` without the extra `hdf5`; what h5py raises for a damaged file.
+    **Raises:** `MissingExtraError` without the extra `hdf5`; h5py's exceptions for a damaged file.
     """
     h5py = require("h5py", "hdf5")
     columns: dict[str, object] = {}
@@ -49,7 +49,7 @@ def hdf5_table(path: Path, largest: int, refuse: Callable[[int], Exception]) -> 
 
 
 def _unreadable(dataset: Any) -> str:
-    """What a dataset is that no signal can come from; empty for numbers."""
+    """Description of a dataset that cannot be a signal; empty for numbers."""
     if dataset.external or dataset.is_virtual:
         return "dataset that lies in another file"
     if dataset.shape is None:

@@ -1,4 +1,4 @@
-"""Joints that columns are named by, in the order of the robot."""
+"""Assignment of columns that are named by joint, in the order of the robot."""
 
 import re
 import warnings
@@ -11,15 +11,15 @@ from ._table import Table
 
 
 def by_joint(source: str, table: Table, told: Description) -> dict[str, list[str]]:
-    """Columns by signal where joints have names, in the order of the robot.
+    """Columns by signal if joints have names, in the order of the robot.
 
     **Arguments:**
 
     - `source`: the file or recording it comes from.
     - `table`: its columns.
-    - `told`: joints, and columns that are given anyway.
+    - `told`: joints, and columns that the user gives explicitly.
 
-    **Raises:** `RecordingError` for joints that are not there.
+    **Raises:** `RecordingError` for joints that do not exist.
     """
     found, joints = table.defaults, told.joints
     if joints is not None and not found:
@@ -61,7 +61,7 @@ def by_joint(source: str, table: Table, told: Description) -> dict[str, list[str
 def _say_order(
     source: str, table: Table, joints: Sequence[str], needed: Sequence[dict[str, str]]
 ) -> None:
-    """Warns of an order that was not given, and of joints without all that is needed."""
+    """Warns of an order that was not given, and of joints that lack a required signal."""
     left = list(dict.fromkeys(j for named in needed for j in named if j not in joints))
     if left:
         warnings.warn(
@@ -70,7 +70,7 @@ def _say_order(
             JaxidWarning,
             stacklevel=7,
         )
-    # Numbers say the order themselves.
+    # Numbers already give the order.
     numbered = len({re.sub(r"\d+", "", joint) for joint in joints}) < 2
     if not table.ordered and not numbered:
         warnings.warn(
@@ -82,6 +82,6 @@ def _say_order(
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """What to sort names by that have numbers in them."""
+    """Sort key for names that contain numbers."""
     parts = re.split(r"(\d+)", name)
     return [(int(part), "") if k % 2 else (0, part) for k, part in enumerate(parts)]

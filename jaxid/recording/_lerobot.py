@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _EPISODE = re.compile(r"episode_(\d+)")
-# What features are called, and the endings of names where one feature holds several signals.
+# Names of features, and the endings of names if one feature holds several signals.
 _CALLED = {
     "q": ("observation.state",),
     "v": ("observation.velocity",),
@@ -32,7 +32,7 @@ _ENDINGS = {"q": (".pos",), "v": (".vel",), "tau": (".torque", ".effort"), "q_re
 
 
 def lerobot_folder(path: Path) -> tuple[Path, int | None] | None:
-    """Folder of a dataset and the episode that a path names, as FOLDER or FOLDER/episode_3."""
+    """Folder of a dataset and the episode, from a path FOLDER or FOLDER/episode_3."""
     match = _EPISODE.fullmatch(path.name)
     if (path / "meta" / "info.json").is_file():
         return path, None
@@ -52,10 +52,10 @@ def episodes(
 
     **Arguments:**
 
-    - `folder`, `only`: of `lerobot_folder`.
-    - `largest`: bytes that are read; `refuse` makes the error for more.
+    - `folder`, `only`: from `lerobot_folder`.
+    - `largest`: most bytes to read; `refuse` makes the error for more.
 
-    **Raises:** `RecordingError` for a dataset that contradicts itself, or has no such episode;
+    **Raises:** `RecordingError` for an inconsistent dataset, or one without such an episode;
         `MissingExtraError` without the extra `parquet`.
     """
     told = _info(source, folder)
@@ -110,7 +110,7 @@ def _frames(
         groups = [file.metadata.row_group(k) for k in range(file.metadata.num_row_groups)]
         chunks = [g.column(c) for g in groups for c in range(g.num_columns)]
         wanted = [c for c in chunks if c.path_in_schema.removesuffix(".list.element") in numbers]
-        # A page of one value can stand for any number of rows.
+        # A page with one value can encode any number of rows.
         size += sum(max(c.total_uncompressed_size, 8 * c.num_values) for c in wanted)
         if size > largest:
             raise refuse(size)
@@ -147,7 +147,7 @@ def _table(source: str, frame: "pd.DataFrame", told: dict[str, Any]) -> Table:
 
 
 def _names(given: Any) -> list[str]:
-    """Names of a feature's parts, which come as a list or as a list under the name of an axis."""
+    """Names of a feature's parts, given as a list or as a list under the name of an axis."""
     if isinstance(given, dict):
         given = next((v for v in given.values() if isinstance(v, list)), None)
     if isinstance(given, list) and len(given) == 1 and isinstance(given[0], list):
@@ -156,7 +156,7 @@ def _names(given: Any) -> list[str]:
 
 
 def _time(columns: dict[str, Any], rate: float) -> Any:
-    """Times, which are kept to seven digits, from the number of the frame where they agree."""
+    """Times, from the frame numbers if they agree, since files keep only seven digits."""
     time = columns.get("timestamp")
     if time is None or rate <= 0 or "frame_index" not in columns:
         return time
@@ -181,7 +181,7 @@ def _defaults(names: dict[str, list[str]], columns: dict[str, Any]) -> dict[str,
 
 
 def _joints(listed: list[str], signal: str, own: bool) -> dict[str, str]:
-    """Joints by the names that a feature gives them for a signal."""
+    """Parts of a feature that belong to a signal, by joint name."""
     endings = _ENDINGS[signal]
     any_ending = tuple(e for several in _ENDINGS.values() for e in several)
     ended = {n.removesuffix(e): n for n in listed for e in endings if n.endswith(e)}

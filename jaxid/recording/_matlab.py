@@ -1,7 +1,7 @@
 """MATLAB files of version 5, read without trusting their headers.
 
-SciPy's reader is C code that does: one wrong bit in a flag can crash the process. Layout as
-in MathWorks' "MAT-File Format".
+SciPy's reader is C code that trusts them: one wrong bit in a flag can crash the process. The layout
+is described in MathWorks' "MAT-File Format".
 """
 
 import math
@@ -36,10 +36,10 @@ def variables(
 
     **Arguments:**
 
-    - `largest`: bytes that compressed variables may unpack to, all together.
-    - `refuse`: what to raise if they are more, given how many there are at least.
+    - `largest`: total bytes to which compressed variables may unpack.
+    - `refuse`: makes the error for more, from a lower bound on their number.
 
-    **Raises:** `ValueError` for whatever the format does not allow.
+    **Raises:** `ValueError` for anything that the format does not allow.
     """
     at, left = 128, largest
     while at < len(data):

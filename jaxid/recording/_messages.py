@@ -1,4 +1,4 @@
-"""What ROS messages say of joints."""
+"""Joint signals in ROS messages."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -11,10 +11,10 @@ Field = tuple[str, Sequence[str], Any]
 
 
 class Kind(eqx.Module):
-    """A type of message: its fields by joint, and which of them may be which signal.
+    """A message type: its fields by joint, and the signals that they may supply.
 
-    - `fields`: of one message; those without values are empty.
-    - `roles`: fields by signal, the best first.
+    - `fields`: returns the fields of one message; those without values are empty.
+    - `roles`: fields by signal, the preferred first.
     """
 
     fields: Callable[[Any], Iterator[Field]]
@@ -53,7 +53,7 @@ def _degrees_of_freedom(message: Any) -> Iterator[Field]:
 
 
 def kinds() -> dict[str, Kind]:
-    """Messages that can be read, by the name of their type."""
+    """Message types that can be read, by name."""
     states = {"q": ["position"], "v": ["velocity"], "tau": ["effort"]}
     trajectory = Kind(
         _trajectory_state,

@@ -17,9 +17,9 @@ def npz_table(source: str, data: bytes, largest: int, refuse: Callable[[int], Ex
 
     **Arguments:**
 
-    - `largest`: bytes that they may unpack to; `refuse` makes the error for more.
+    - `largest`: bytes to which they may unpack; `refuse` makes the error for more.
 
-    **Raises:** `RecordingError` for an array of objects; what zipfile raises for a damaged file.
+    **Raises:** `RecordingError` for an array of objects; zipfile's exceptions for a damaged file.
     """
     if data.startswith(np.lib.format.MAGIC_PREFIX):
         npy(data)

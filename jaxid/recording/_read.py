@@ -35,9 +35,9 @@ class Contents(eqx.Module):
     """What `contents_of` found in a file.
 
     - `columns`: names of its columns, arrays or streams.
-    - `signals`: columns by signal, as `jaxid.read` takes them; empty where it cannot.
-    - `joints`: names of joints, where columns carry them.
-    - `about`: what else there is, a line each: topics of a bag, features of a dataset.
+    - `signals`: columns by signal, as `jaxid.read` takes them; empty if it cannot.
+    - `joints`: names of joints, if columns are named by them.
+    - `about`: other contents, one per line: topics of a bag, features of a dataset.
     """
 
     columns: tuple[str, ...]
@@ -58,35 +58,36 @@ def read(
     clock: Clock = "recorded",
     largest: int = LARGEST,
 ) -> Recordings:
-    """Reads recordings from text, Parquet, MATLAB, NumPy, HDF5, bags of ROS 2 and LeRobot datasets.
+    """Reads recordings from text, Parquet, MATLAB, NumPy, HDF5, ROS 2 bags and LeRobot datasets.
 
     **Arguments:**
 
     - `paths`: one for each recording, which takes its name: `.csv`, `.tsv`, `.txt` (or these
       `.gz`), `.parquet`, `.mat`, `.npz`, `.h5`, `.hdf5`, a bag (its folder, `.mcap` or `.db3`); or
       the folder of a LeRobot dataset for all of its episodes, `FOLDER/episode_3` for one.
-    - `columns`: maps signals to the file's names, e.g. `{"time": "t", "q": ["pos1", "pos2"]}`; a
-      be a product, `"gain*current"`, and `time` the period, as a number or the name of one. Where
-      silent: `time`, `q_1..n`, `tau_1..n` and, if there, `q_ref_1..n`, `v_1..n`, `tau_ff_1..n`,
-      `v_ref_1..n`, `kp_1..n`, `kd_1..n`, `supply_1..n`, `on_1..n`, of which the last five may be
-      numbers in place of names; also `q`, `tau`, ... for all joints at once. Files of the EMPS
-      benchmark are recognised, and joint states of bags and datasets. Other columns are ignored.
-    - `joints`: names of joints in the order of the robot, where a bag or dataset has them; all of
-      them by name where silent.
-    - `units`: unit by signal, e.g. `{"q": "deg", "v": "deg/s", "tau": "N·mm", "time": "ms"}`; SI
-      where silent, `q_ref` as `q`, `tau_ff` as `tau`, `v_ref` as `v`.
+    - `columns`: maps signals to the file's names, e.g. `{"time": "t", "q": ["pos1", "pos2"]}`. A
+      name may be a product, `"gain*current"`, and `time` the period, as a number or the name of
+      one. Default: `time`, `q_1..n`, `tau_1..n` and, if present, `q_ref_1..n`, `v_1..n`,
+      `tau_ff_1..n`, `v_ref_1..n`, `kp_1..n`, `kd_1..n`, `supply_1..n`, `on_1..n`, of which the last
+      five may be numbers instead of names; also `q`, `tau`, ... for all joints at once. Files of
+      the EMPS benchmark are recognised, and joint states of bags and datasets. Other columns are
+      ignored.
+    - `joints`: names of joints in the order of the robot, if a bag or dataset has them; by default
+      all of them, sorted by name.
+    - `units`: unit by signal, e.g. `{"q": "deg", "v": "deg/s", "tau": "N·mm", "time": "ms"}`; SI by
+      default, `q_ref` as `q`, `tau_ff` as `tau`, `v_ref` as `v`.
     - `scale`: factor by signal, one or one for each joint, e.g. `{"tau": [0.062 * 100, 0.05 * 50]}`
       for amperes, by torque constant and gear ratio, or `{"q": 2 * np.pi / 4096}` for counts;
       `q_ref` as `q`, `tau_ff` as `tau`.
     - `resolution`: encoder step, one or one for each joint, rad or m.
     - `gaps`: `"allow"` to accept missing stretches of time.
     - `nan`: `"drop"` to leave out samples at which a signal is empty; a warning counts them.
-    - `clock`: `"even"` to treat samples as evenly spaced where a logger's times jitter.
-    - `largest`: size in bytes, unpacked, above which a file is refused; text takes about ten times
-      that much memory while it is read.
+    - `clock`: `"even"` to treat samples as evenly spaced if a logger's times jitter.
+    - `largest`: size in bytes, unpacked, above which a file is refused; reading text takes about
+      ten times that much memory.
 
-    **Raises:** `RecordingError` for whatever makes a file unusable; `MissingExtraError` for a
-    format whose extra is not installed.
+    **Raises:** `RecordingError` for a file that cannot be used; `MissingExtraError` for a format
+    whose extra is not installed.
     """
     if not paths:
         raise problem("read()", "no file was given", "pass at least one path")
@@ -105,7 +106,7 @@ def contents_of(
     joints: Sequence[str] | None = None,
     largest: int = LARGEST,
 ) -> Contents:
-    """What a file holds: of a dataset, its first episode.
+    """Contents of a file; of a dataset, those of its first episode.
 
     **Arguments:**
 
@@ -125,7 +126,7 @@ def contents_of(
 
 
 def _tables(path: Path, largest: int) -> Iterator[tuple[str, str, Table]]:
-    """What messages call it, its name, and the table of each recording that a path holds."""
+    """Name in messages, own name, and table of each recording at a path."""
     source = str(path)
 
     def refuse(size: int) -> Exception:
@@ -150,7 +151,7 @@ def _tables(path: Path, largest: int) -> Iterator[tuple[str, str, Table]]:
 
 @contextlib.contextmanager
 def _said(source: str, path: Path) -> Iterator[None]:
-    """Turns what parsers raise into a sentence."""
+    """Converts the exceptions of parsers to a one-sentence error."""
     try:
         yield
     except (JaxidError, GeneratorExit):
@@ -292,7 +293,7 @@ Numbered = list[tuple[int, str]]
 
 
 def _header(source: str, lines: Numbered) -> tuple[list[str], str, Numbered]:
-    """Column names, delimiter (empty for blanks) and the lines below with their numbers."""
+    """Column names, delimiter (empty for whitespace) and the lines below with their numbers."""
     comments = list(itertools.takewhile(_is_comment, (line for _, line in lines)))
     rows = [pair for pair in lines if not _is_comment(pair[1])]
     first = rows[0][1] if rows else ""

@@ -32,18 +32,18 @@ class Recording(eqx.Module):
 
     - `time`: `(samples,)`, s.
     - `q`: measured position, `(samples, joints)`, rad or m.
-    - `tau`: the drive's commanded torque as recorded, `(samples, joints)`, N·m or N; V where a
-      motor is driven by voltage (`jaxid.effects.DCMotor`).
+    - `tau`: the drive's commanded torque as recorded, `(samples, joints)`, N·m or N; V if a motor
+      is driven by voltage (`jaxid.effects.DCMotor`).
     - `q_ref`: reference, `(samples, joints)`, rad or m, or None.
     - `v`: measured velocity, `(samples, joints)`, rad/s or m/s, or None.
     - `tau_ff`: known torque added to the controller's output, which `tau` contains,
       `(samples, joints)`, N·m or N, or None.
-    - `v_ref`, `kp`, `kd`: velocity reference, rad/s or m/s, and gains that the drives were told
-      with every sample, in the unit that the law takes, `(samples, joints)`, or None.
-    - `supply`: measured voltage that feeds the drives, `(samples, joints)`, V, or None.
+    - `v_ref`, `kp`, `kd`: velocity reference, rad/s or m/s, and gains that were commanded with
+      every sample, in the unit that the law takes, `(samples, joints)`, or None.
+    - `supply`: measured supply voltage of the drives, `(samples, joints)`, V, or None.
     - `on`: 1 where a drive is powered, 0 where its motor is open, `(samples, joints)`, or None.
     - `resolution`: encoder step, `(joints,)`, rad or m, or None.
-    - `name`: how tables and figures call it.
+    - `name`: its name in tables and figures.
     """
 
     time: Float64[np.ndarray, " samples"]
@@ -90,13 +90,13 @@ class Recording(eqx.Module):
         - `time`: `(samples,)`, s.
         - `q`, `tau`, `q_ref`, `v`, `tau_ff`: `(samples, joints)`, or `(samples,)` for one joint;
           rad or m, N·m or N.
-        - `v_ref`, `kp`, `kd`, `supply`, `on`: as the fields; a lone number holds for all samples.
+        - `v_ref`, `kp`, `kd`, `supply`, `on`: as the fields; one number holds for all samples.
         - `resolution`: encoder step, one or one for each joint, rad or m.
-        - `name`: how tables and figures call it.
-        - `units`, `scale`: unit and factor by signal where it is not SI, as in `jaxid.read`.
+        - `name`: its name in tables and figures.
+        - `units`, `scale`: unit and factor by signal if it is not SI, as in `jaxid.read`.
         - `gaps`, `nan`, `clock`: as in `jaxid.read`.
 
-        **Raises:** `RecordingError` for whatever makes them unusable.
+        **Raises:** `RecordingError` if they cannot be used.
         """
         given = {"time": time, "q": q, "tau": tau, "q_ref": q_ref, "v": v, "tau_ff": tau_ff}
         given |= {"v_ref": v_ref, "kp": kp, "kd": kd, "supply": supply, "on": on}
@@ -129,12 +129,12 @@ class Recording(eqx.Module):
         **Arguments:**
 
         - `table`: one row for each sample, columns as in `jaxid.read`: a pandas DataFrame, an Arrow
-          table, or another that Arrow can take (Polars, DuckDB). A column may hold lists, of one
-          number for each joint.
+          table, or another that Arrow can read (Polars, DuckDB). A column may hold lists with one
+          number per joint.
         - `columns`, `units`, `scale`, `gaps`, `nan`, `clock`: as in `jaxid.read`.
-        - `name`, `resolution`: as in `from_arrays`; where None, what `to_dataframe` noted.
+        - `name`, `resolution`: as in `from_arrays`; if None, the values stored by `to_dataframe`.
 
-        **Raises:** `RecordingError` for whatever makes it unusable.
+        **Raises:** `RecordingError` if it cannot be used.
         """
         frame = frame_of(str(name or "recording"), table)
         name = str(name or frame.attrs.get("name") or "recording")
@@ -150,22 +150,22 @@ class Recording(eqx.Module):
 
     @classmethod
     def from_dataframe(cls, frame: "pd.DataFrame", **options: Any) -> "Recording":
-        """A recording from a pandas DataFrame; options as of `from_table`, which takes it too."""
+        """A recording from a pandas DataFrame; options as in `from_table`, which also takes one."""
         return cls.from_table(frame, **options)
 
     @property
     def samples(self) -> int:
-        """How many samples it has."""
+        """Number of samples."""
         return self.q.shape[0]
 
     @property
     def joints(self) -> int:
-        """How many joints it has."""
+        """Number of joints."""
         return self.q.shape[1]
 
     @property
     def duration(self) -> float:
-        """From the first to the last sample, s."""
+        """Time from the first to the last sample, s."""
         return float(self.time[-1] - self.time[0])
 
     @property
@@ -175,7 +175,7 @@ class Recording(eqx.Module):
 
     @property
     def rate(self) -> float:
-        """Samples in a second, Hz."""
+        """Sample rate, Hz."""
         return 1 / self.period
 
     @property
@@ -217,7 +217,7 @@ class Recording(eqx.Module):
         return Recording(**cut, resolution=self.resolution, name=self.name)
 
     def to_dataframe(self) -> "pd.DataFrame":
-        """One row for each sample; `from_table` gives the same recording back."""
+        """A table with one row for each sample; `from_table` restores the recording from it."""
         import pandas as pd
 
         columns = {}
@@ -291,7 +291,7 @@ class Recordings(eqx.Module):
     def common_period(self) -> float:
         """The common sample period, s, which noise filters require.
 
-        **Raises:** `RecordingError` where periods differ by more than a hundredth.
+        **Raises:** `RecordingError` if periods differ by more than 1 %.
         """
         first = self.recordings[0]
         for other in self.recordings:
@@ -342,12 +342,12 @@ def build(source: str, name: str, picked: Picked, told: Description) -> Recordin
 
     **Arguments:**
 
-    - `source`: what messages call it, e.g. its path.
+    - `source`: its name in messages, e.g. its path.
     - `name`: the recording's name.
     - `picked`: the signals, in the units of the file.
-    - `told`: their units, and what of their faults to put up with.
+    - `told`: their units, and which of their faults to accept.
 
-    **Raises:** `RecordingError` for whatever makes them unusable.
+    **Raises:** `RecordingError` if they cannot be used.
     """
     signals = validate(
         source, picked.signals, picked.labels, told.units, told.scale, told.accept, picked.lines

@@ -1,4 +1,4 @@
-"""Signals that were sampled at times of their own, put on those of one of them."""
+"""Resampling of signals with different sample times to those of one of them."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from ..errors import JaxidWarning
 from ._checks import missing_after
 from ._problem import problem
 
-# Steps of time that a message may come late behind one of a later stamp.
+# Time steps by which a message may arrive after one with a later stamp.
 _LATE = 10
 
 
@@ -26,18 +26,18 @@ class Stream(eqx.Module):
 def aligned(
     source: str, columns: Mapping[str, object], labels: Mapping[str, Sequence[str]]
 ) -> dict[str, object]:
-    """Columns with the streams that signals use at the times of the first position.
+    """Columns in which the streams that signals use are resampled to the first position's times.
 
     Streams with other stamps are interpolated linearly, and are empty inside their gaps. Samples
-    before or after any of them are left out.
+    before the start or after the end of any stream are left out.
 
     **Arguments:**
 
-    - `source`: what messages call the file.
+    - `source`: name of the file in messages.
     - `columns`: arrays and streams by name.
     - `labels`: the columns of each signal; `"time"` is the time since the first position, s.
 
-    **Raises:** `RecordingError` where streams have no time in common.
+    **Raises:** `RecordingError` if streams have no time in common.
     """
     named = [factor.strip() for names in labels.values() for n in names for factor in n.split("*")]
     used = {n: x for n in named if isinstance(x := columns.get(n), Stream)}
@@ -69,10 +69,10 @@ def aligned(
 
 
 def _in_order(source: str, stream: Stream) -> Stream:
-    """The stream by its stamps, where messages only overtook each other on their way."""
+    """The stream sorted by its stamps, if messages only overtook each other in transit."""
     steps = np.diff(stream.stamps)
     back = -int(steps.min(initial=0))
-    # A clock that was set back is another matter, which the checks of times refuse.
+    # A clock that was set back is a different fault, which the checks of times refuse.
     if back <= 0 or back > _LATE * np.median(np.abs(steps)):
         return stream
     order = np.argsort(stream.stamps, kind="stable")
@@ -80,8 +80,8 @@ def _in_order(source: str, stream: Stream) -> Stream:
 
 
 def _at(stream: Stream, at: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, " times"]:
-    """Values at other stamps, NaN where the stream itself has a gap."""
-    # Differences of whole numbers, for a stamp of today in ns has more digits than a float.
+    """Values at other stamps, NaN inside gaps of the stream."""
+    # Differences of integers, since a current stamp in ns has more digits than a float.
     own, wanted = ((x - stream.stamps[0]).astype(np.float64) for x in (stream.stamps, at))
     values = np.interp(wanted, own, stream.values)
     if len(own) > 2:

@@ -1,4 +1,4 @@
-"""Named columns as a file or a table in memory has them."""
+"""Named columns of a file or a table in memory."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -13,15 +13,15 @@ if TYPE_CHECKING:
 
 
 class Table(eqx.Module):
-    """Named columns of one file, not yet looked at.
+    """Named columns of one file, not yet checked.
 
-    - `columns`: array-likes, or streams of their own times, by name.
-    - `refused`: names what the file also holds but cannot be a column, and says what it is.
-    - `lines`: of the rows in a text file.
-    - `defaults`: where joints have names, the column of each by signal and joint; in the order of
-      the robot where `ordered`.
-    - `unclear`: why a signal has no such columns though there are some.
-    - `about`: what else is to be said of the file, a line each.
+    - `columns`: array-likes, or streams with their own times, by name.
+    - `refused`: other contents of the file that cannot be columns, by name, and what they are.
+    - `lines`: line numbers of the rows in a text file.
+    - `defaults`: if joints have names, the column of each by signal and joint; in the order of the
+      robot if `ordered`.
+    - `unclear`: why a signal has no default columns although candidates exist.
+    - `about`: further notes on the file, one per line.
     """
 
     columns: dict[str, object]

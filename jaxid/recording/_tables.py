@@ -1,4 +1,4 @@
-"""Tables in memory, of whatever library, as pandas has them."""
+"""Conversion of tables in memory, from any library, to pandas."""
 
 from typing import TYPE_CHECKING
 
@@ -10,15 +10,15 @@ if TYPE_CHECKING:
 
 
 def frame_of(source: str, table: object) -> "pd.DataFrame":
-    """A DataFrame of a table that is one, or that Arrow can take.
+    """A DataFrame from a table that is one, or that Arrow can read.
 
     **Arguments:**
 
-    - `source`: what messages call it.
+    - `source`: its name in messages.
     - `table`: a pandas DataFrame, an Arrow table, or another with `__arrow_c_stream__`.
 
-    **Raises:** `RecordingError` for what is no table; `MissingExtraError` without the extra
-        `parquet` for a table that is not of pandas.
+    **Raises:** `RecordingError` if it is not a table; `MissingExtraError` without the extra
+        `parquet` for a table that is not from pandas.
     """
     import pandas as pd
 
@@ -31,5 +31,5 @@ def frame_of(source: str, table: object) -> "pd.DataFrame":
             "give a pandas DataFrame or an Arrow table, or use Recording.from_arrays",
         )
     arrow = require("pyarrow", "parquet")
-    # The metadata of pandas could make a column an index and so hide it.
+    # The metadata of pandas could turn a column into an index and so hide it.
     return arrow.table(table).to_pandas(ignore_metadata=True)

@@ -1,4 +1,4 @@
-"""Units of files, and their factors to SI."""
+"""Units of files, and their conversion factors to SI."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ _POSITION = {
 }
 _VELOCITY = {f"{unit}/s": factor for unit, factor in _POSITION.items()} | {"rpm": math.pi / 30}
 _VOLTAGE = {"V": 1.0, "mV": 1e-3}
-# A drive that is commanded by voltage has one where others have a torque.
+# A drive that is commanded by voltage has a voltage in place of a torque.
 _TORQUE = {"Nm": 1.0, "mNm": 1e-3, "Nmm": 1e-3, "kNm": 1e3, "N": 1.0, "kN": 1e3} | _VOLTAGE
 _GAIN = {"1": 1.0}
 
@@ -39,7 +39,7 @@ SIGNALS: Mapping[str, Mapping[str, float]] = {
     "supply": _VOLTAGE,
     "on": {"1": 1.0},
 }
-# Those that a drive is told or is fed at a sample, and that hold until the next.
+# Signals that a drive is commanded or supplied with at a sample, and that hold until the next.
 HELD = ("v_ref", "kp", "kd", "supply", "on")
 
 # Signals of the same instrument have the same unit by default.
@@ -61,8 +61,8 @@ def factors(
 
     **Returns:** factors by signal; one, or one for each joint.
 
-    **Raises:** `RecordingError` for a signal or a unit that is not known, and for a factor that is
-        nil or no number.
+    **Raises:** `RecordingError` for an unknown signal or unit, and for a factor that is zero or not
+        a number.
     """
     in_units, scaled = _completed(source, "units", units), _completed(source, "scale", scale)
     found = {}
@@ -80,7 +80,7 @@ def factors(
 
 
 def _completed(source: str, what: str, given: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What is given by signal, and for signals that share the unit of another."""
+    """The given values by signal, completed for signals that share the unit of another."""
     whole = dict(given or {})
     for signal in whole:
         if signal not in SIGNALS:

@@ -15,11 +15,11 @@ _APERIODIC = 0.05
 def fourier_basis(
     time: Float[np.ndarray, " samples"], period: float, harmonics: int
 ) -> Float[np.ndarray, "3 samples coefficients"]:
-    """1, cos, sin of each harmonic in turn, and their first and second derivatives in time.
+    """1, then cos and sin of each harmonic, and their first and second derivatives in time.
 
     **Arguments:**
 
-    - `time`: s. `period`: s. `harmonics`: how many; there are twice as many and one coefficients.
+    - `time`: s. `period`: s. `harmonics`: their number; there are 2 · harmonics + 1 coefficients.
     """
     rate = 2 * np.pi * np.arange(1, harmonics + 1) / period
     angle = np.outer(time, rate)
@@ -39,7 +39,7 @@ class FourierSeries(eqx.Module):
 
     @property
     def harmonics(self) -> int:
-        """How many."""
+        """Number of harmonics."""
         return (self.coefficients.shape[0] - 1) // 2
 
     def __call__(
@@ -83,9 +83,9 @@ def period_of(recording: Recording, period: float | None = None) -> float:
 
     **Arguments:**
 
-    - `period`: as known, s; from the reference (else the position) where None.
+    - `period`: if known, s; None to find it from the reference, or the position without one.
 
-    **Raises:** `FitError` where the motion does not repeat.
+    **Raises:** `FitError` if the motion does not repeat.
     """
     import scipy
 
@@ -123,7 +123,7 @@ def period_of(recording: Recording, period: float | None = None) -> float:
     )
     differ = differ / x.shape[1]
     low = differ < max(2.0 * float(differ.min()), _APERIODIC**2)
-    # Slow motion differs little over short lags: look after the first large difference.
+    # Slow motion differs little over short lags, so search after the first large difference.
     far = int(np.argmax(differ > 0.5)) if np.any(differ > 0.5) else len(lags)
     low[:far] = False
     if not low.any() or float(differ[low].min()) > _APERIODIC**2:
@@ -138,7 +138,7 @@ def period_of(recording: Recording, period: float | None = None) -> float:
     fine = np.linspace(best - 1, best + 1, 201)
     fine = fine[(fine >= 1) & (fine < n - 2)]
     found = float(fine[int(np.argmin([_interpolated(x, lag) for lag in fine]))]) / rate
-    # A whole number of samples is preferred where it fits as well: most references have one.
+    # Prefer a whole number of samples if it fits as well, since most references have one.
     if abs(found * rate - best) < 0.05:
         found = float(best / rate)
     return period_of(recording, found)
@@ -147,14 +147,14 @@ def period_of(recording: Recording, period: float | None = None) -> float:
 def settle_harmonics(recording: Recording, period: float, harmonics: int | None) -> Harmonics:
     """Number of harmonics of a recorded motion, by BIC over all joints.
 
-    Each joint's errors are weighted by their variance: that of the encoder's step, Q²/12, or the
+    Each joint's errors are divided by their variance: that of the encoder's step, Q²/12, or the
     residual of the largest series, whichever is larger.
 
     **Arguments:**
 
-    - `period`: s. `harmonics`: as given, which is checked only; None to choose.
+    - `period`: s. `harmonics`: a given number, which is only checked; None to choose.
 
-    **Raises:** `FitError` where there are too few samples in a period for the harmonics.
+    **Raises:** `FitError` if a period has too few samples for the harmonics.
     """
     import scipy
 
@@ -211,9 +211,9 @@ def repeated(recording: Recording, period: float | None = None) -> Repeated:
 
     **Arguments:**
 
-    - `period`: s; found where None.
+    - `period`: s; None to find it.
 
-    **Raises:** `FitError` where it is not periodic, or holds fewer than two whole periods.
+    **Raises:** `FitError` if it is not periodic, or has fewer than two whole periods.
     """
     period = period_of(recording, period)
     time = even_times(recording)

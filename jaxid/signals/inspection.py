@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _REST = 0.01
 # Share of it that a joint must reach in both directions to count as reversing.
 _TURN = 0.1
-# Correlation from which two references of one size are one.
+# Correlation above which two references of equal amplitude count as the same.
 _SAME = 0.9999
 
 
@@ -31,9 +31,9 @@ class Inspection(eqx.Module):
       time after which the reference repeats itself, and the frequency up to which the motion is
       known.
     - `joints`: one row for each recording and joint: range of q, top speed, share of time at rest,
-      how often it turns, torque, the step that all readings of q are multiples of (nil without
-      one), and what is seen of a sampled law: `"every 4"` where torque is held for so many samples,
-      `"each"` where it follows the readings sample by sample, `"-"` for nothing.
+      number of reversals, torque, the step of which all readings of q are multiples (zero without
+      one), and the sampled law if detected: `"every 4"` if torque is held for that many samples,
+      `"each"` if it follows the readings sample by sample, `"-"` if none is detected.
     - `repeats`: pairs of recordings whose references are the same.
     - `notes`: problems to correct, and hints.
     """
@@ -56,7 +56,7 @@ class Inspection(eqx.Module):
         return f"{self.signals.to_html()}{self.joints.to_html()}<ul>{said}</ul>"
 
     def to_dict(self) -> dict[str, Any]:
-        """The same as plain JSON."""
+        """The content as plain JSON."""
         joints = self.joints.reset_index().to_dict("records")
         return {
             "recordings": self.signals.reset_index().to_dict("records"),
@@ -107,21 +107,21 @@ def _times(r: Recording) -> dict[str, Any]:
 
 
 def _period(r: Recording) -> float:
-    """Seconds after which the reference, or else the motion, repeats itself; nil if it does not."""
+    """Period of the reference, or of the motion without one, s; zero if it does not repeat."""
     x = resampled(r.time, r.q if r.q_ref is None else r.q_ref, even_times(r))
     found = period(x)
     return 0.0 if found is None else found * r.duration / (r.samples - 1)
 
 
 def _law(r: Recording, joint: int) -> str:
-    """What the torque of a joint shows of a sampled law."""
-    # At a gap position and torque jump together.
+    """The sampled law that the torque of a joint shows."""
+    # At a gap, position and torque jump together.
     edges = [0, *(np.flatnonzero(missing_after(r.time)) + 1).tolist(), r.samples]
     whole = max(itertools.pairwise(edges), key=lambda piece: piece[1] - piece[0])
     tau, q = r.tau[slice(*whole), joint], r.q[slice(*whole), joint]
     if (samples := held(tau)) > 1:
         return f"every {samples}"
-    # The reference adds nothing that the encoder did not say.
+    # The reference adds no information beyond that of the encoder.
     return "each" if is_followed(follows(q, tau)) else "-"
 
 
@@ -152,7 +152,7 @@ def _by_joint(r: Recording, cutoff: float) -> list[dict[str, Any]]:
 
 
 def repeats_of(recordings: Recordings) -> tuple[tuple[str, str], ...]:
-    """Names of recordings that follow the same reference, or the same motion where none is given.
+    """Names of recordings with the same reference, or with the same motion if they have none.
 
     **Arguments:**
 
@@ -166,11 +166,11 @@ def repeats_of(recordings: Recordings) -> tuple[tuple[str, str], ...]:
 
 
 def _repeat(one: Recording, other: Recording) -> bool:
-    """Whether two recordings have the same reference, or else motion, by the clock or its start."""
+    """Whether two recordings have the same reference (or motion), by time or from its start."""
     x, y = (r.q if r.q_ref is None else r.q_ref for r in (one, other))
     for start in (0.0, one.time[0]):
         s, t = one.time - start, other.time - (start and other.time[0])
-        # A reference moves little between two samples, which are at other times in the other.
+        # The sample times of the two differ, but a reference changes little between two samples.
         both = (s >= t[0]) & (s <= t[-1])
         if both.mean() < 0.9 or t[-1] - t[0] > 1.1 * (s[-1] - s[0]):
             continue
@@ -211,7 +211,7 @@ def _notes(recordings: Recordings, joints: "pd.DataFrame") -> list[str]:
 
 
 def _notes_on_times(r: Recording) -> list[str]:
-    """Gaps of a recording, and its reference where that repeats or has a clock of its own."""
+    """Gaps of a recording, and its reference if that repeats or has its own clock."""
     notes = []
     gaps = np.flatnonzero(missing_after(r.time))
     if len(gaps):
@@ -238,7 +238,7 @@ def _notes_on_times(r: Recording) -> list[str]:
 
 
 def _notes_on_clocks(recordings: Recordings, joints: "pd.DataFrame") -> list[str]:
-    """Encoder steps and the law's clock, each said once for all recordings that agree."""
+    """Encoder steps and the law's clock, each noted once for all recordings that agree."""
     notes = []
     smallest: dict[str, list[int]] = {}
     for j in range(1, recordings.joints + 1):

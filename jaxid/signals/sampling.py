@@ -1,14 +1,14 @@
-"""What signals show of clocks: values that are held, readings that are followed, periods."""
+"""Detection of clocks in signals: held values, torque computed from readings, periods."""
 
 import numpy as np
 from jaxtyping import Float
 
-# Share of holds that last as long as the usual one, or a multiple of it, where a clock holds.
+# Share of holds that must last as long as the usual one, or a multiple of it, for a clock.
 _REGULAR = 0.9
-# Coherence above a quarter of the sample rate from which torque is computed from those readings. Of
-# eight half-overlapping pieces, unrelated signals have 0.15.
+# Coherence above a quarter of the sample rate at which torque counts as computed from the readings.
+# With eight half-overlapping segments, unrelated signals have 0.15.
 _COHERENT, _PIECES = 0.5, 8
-# How much lower an encoder's spectrum is near half the sample rate than near a quarter, at most.
+# Largest decrease of an encoder's spectrum from a quarter to half of the sample rate.
 _FALLS = 10.0
 # Share of a signal's variance by which it may differ from itself a period later, and by which it
 # has to differ in between.
@@ -16,7 +16,7 @@ _SAME, _OTHER = 1e-4, 0.1
 
 
 def held(x: Float[np.ndarray, " samples"]) -> int:
-    """For how many samples a signal keeps each value, 1 where no clock is seen in it.
+    """Number of samples for which a signal holds each value; 1 if no clock is detected.
 
     **Arguments:**
 
@@ -34,9 +34,10 @@ def follows(
 ) -> float | None:
     """Coherence of torque with readings above a quarter of the sample rate, by its median.
 
-    What a robot does up there is less than what its encoder adds, so a torque that follows was
-    computed from these very samples (Welch 1967). None for recordings that are too short, and for
-    readings whose spectrum still falls up there, which show the motion and no encoder.
+    At these frequencies the robot's motion is smaller than the encoder's noise, so a coherent
+    torque was computed from these samples (Welch 1967). None for recordings that are too short, and
+    for readings whose spectrum still falls at these frequencies, since they show the motion rather
+    than the encoder.
 
     **Arguments:**
 
@@ -48,7 +49,7 @@ def follows(
     length = min(256, len(readings) // _PIECES)
     if length < 16 or not np.ptp(readings) or not np.ptp(tau):
         return None
-    # Side lobes below the encoder's steps, for the motion is 10⁵ times as large as these.
+    # The side lobes must be below the encoder's steps, and the motion is 10⁵ times as large.
     how = {"nperseg": length, "window": "blackmanharris", "detrend": "linear"}
     frequency, power = scipy.signal.welch(readings, **how)
     lower, upper = (power[(frequency > f) & (frequency < f + 0.1)].mean() for f in (0.25, 0.38))
@@ -61,16 +62,16 @@ def follows(
 
 
 def is_followed(coherence: float | None) -> bool:
-    """Whether a coherence of `follows` says that torque was computed from the readings."""
+    """Whether a coherence from `follows` shows that torque was computed from the readings."""
     return coherence is not None and coherence > _COHERENT
 
 
 def period(x: Float[np.ndarray, "samples columns"]) -> int | None:
-    """After how many samples signals repeat themselves, None where they do not within half of them.
+    """Number of samples after which signals repeat; None if that exceeds half of their length.
 
     **Arguments:**
 
-    - `x`: samples at even times, of any unit, `(samples, columns)`.
+    - `x`: samples at even times, in any unit, `(samples, columns)`.
     """
     n = len(x)
     x = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), 1e-300)
@@ -81,7 +82,7 @@ def period(x: Float[np.ndarray, "samples columns"]) -> int | None:
     power = (np.abs(np.fft.rfft(x, size, axis=0)) ** 2).sum(axis=1)
     lags = np.arange(n // 2 + 1)
     products = np.fft.irfft(power, size)[lags]
-    # Squares of the samples that have a partner so much later, and of those partners.
+    # Squares of the samples that have a partner at each lag, and of those partners.
     sums = np.concatenate([[0.0], np.cumsum((x**2).sum(axis=1))])
     squares = sums[n - lags] + sums[n] - sums[lags]
     apart = (squares - 2 * products) / (2 * x.shape[1] * (n - lags))
@@ -90,6 +91,6 @@ def period(x: Float[np.ndarray, "samples columns"]) -> int | None:
     again = again[again > far[0]] if len(far) else again[:0]
     if not len(again):
         return None
-    # Beside a period, lags that are nearly one are nearly as close.
+    # Lags close to a period agree almost as well as the period itself.
     near = again[again < again[0] + max(2, again[0] // 20)]
     return int(near[np.argmin(apart[near])])

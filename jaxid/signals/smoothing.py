@@ -22,12 +22,12 @@ _SAMPLES = 2.5
 def low_pass(
     x: Float[np.ndarray, "samples columns"], rate: float, cutoff: float, order: int = ORDER
 ) -> Float[np.ndarray, "samples columns"]:
-    """Even samples through a Butterworth low-pass, forward and backward.
+    """Filters evenly spaced samples by a Butterworth low-pass, forward and backward.
 
     **Arguments:**
 
     - `x`: `(samples, columns)`.
-    - `rate`: samples in a second, Hz. `cutoff`: of the filter, Hz.
+    - `rate`: sample rate, Hz. `cutoff`: of the filter, Hz.
     """
     import scipy
 

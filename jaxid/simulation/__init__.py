@@ -1,4 +1,4 @@
-"""Closed loops, their integration, batches of recordings, and sharing over cores and devices."""
+"""Closed loops, their integration, batches of recordings, and distribution over cores."""
 
 from .integration import reason as reason
 from .loop import ClosedLoop as ClosedLoop

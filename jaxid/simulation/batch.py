@@ -1,4 +1,4 @@
-"""Recordings as a batch of intervals that drive a loop: made on the host, with NumPy."""
+"""Recordings as a batch of intervals that drive a loop, built on the host with NumPy."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,12 +18,12 @@ from .loop import ClosedLoop
 
 
 class Interval(eqx.Module):
-    """What drives the loop from one grid point to the next; the last interval has no length.
+    """Inputs of the loop from one grid point to the next; the last interval has zero length.
 
-    `reference` holds the coefficients of the interval's cubic, `torque` those of a line, `held`
-    signals of the recording that do not change in it, by name, `(joints,)` each; `noise`
+    `reference` holds the coefficients of the interval's cubic, `torque` those of a line. `held`
+    holds the signals of the recording that are constant in it, by name, `(joints,)` each. `noise`
     and `rate` are added to the position and velocity that the sensors read, `push` and `pull` to
-    the torque on drives and links, each given at both ends and joined by a line, or None.
+    the torque on drives and links; each is given at both ends and is linear in between, or is None.
     """
 
     t0: Float[Array, ""]
@@ -42,10 +42,10 @@ class Interval(eqx.Module):
 class Batch(eqx.Module):
     """Recordings padded to one length, so that one `vmap` covers them.
 
-    `intervals` has `(recordings, points)` before the axes of each leaf. `at` says which grid
-    points are samples, `mask` which of those are there; the initial state is `q0`, `v0`; `q`,
-    `tau` are the measured signals. `band` says which part of them the controller lets compare,
-    None for all.
+    `intervals` has `(recordings, points)` before the axes of each leaf. `at` gives the grid points
+    that are samples, `mask` marks those that are not padding. The initial state is `q0`, `v0`; `q`
+    and `tau` are the measured signals. `band` is the part of them that is compared under this
+    controller, None for all.
     """
 
     intervals: Interval
@@ -60,13 +60,13 @@ class Batch(eqx.Module):
 
     @property
     def kept(self) -> Bool[Array, "recordings rows"]:
-        """Which of the compared rows are there."""
+        """Which of the compared rows are not padding."""
         return self.mask if self.band is None else self.band.keep
 
     def compared(
         self, x: Float[Any, "recordings samples *axes"]
     ) -> Float[Any, "recordings rows *axes"]:
-        """What of signals at the samples, zero where there is none, is compared."""
+        """The part of signals at the samples that is compared, with zeros for missing samples."""
         return x if self.band is None else self.band(jnp.asarray(x))
 
 
@@ -89,13 +89,13 @@ def _pieces(
 
 
 def _grid(recording: Recording, period: float | None) -> tuple[np.ndarray, np.ndarray]:
-    """Grid times and which of them are ticks: the samples, and the controller's own instants."""
+    """Grid times (the samples and the controller's own ticks), and which of them are ticks."""
     time = recording.time
     if period is None:
         grid = _without_gaps(time, recording.period)
         return grid, np.zeros(len(grid), bool)
     ticks = time[0] + period * np.arange(int((time[-1] - time[0]) / period + 1e-6) + 1)
-    # Instants closer than a thousandth of a period are the same: clocks are written in decimals.
+    # Times closer than a thousandth of a period are equal, since files round them to decimals.
     near = time[np.clip(np.searchsorted(time, ticks - 1e-3 * period), 0, len(time) - 1)]
     ticks = np.where(np.abs(near - ticks) < 1e-3 * period, near, ticks)
     grid = np.union1d(time, ticks)
@@ -105,7 +105,7 @@ def _grid(recording: Recording, period: float | None) -> tuple[np.ndarray, np.nd
 def _without_gaps(
     time: Float[np.ndarray, " samples"], period: float
 ) -> Float[np.ndarray, " points"]:
-    """The samples, and evenly between them where they are further apart than usual."""
+    """The samples, with evenly spaced points added where samples are further apart than usual."""
     parts = np.maximum(np.round(np.diff(time) / period - 0.25), 1).astype(int)
     if parts.max() == 1:
         return time
@@ -123,7 +123,7 @@ def _drive(
     noise: np.ndarray | None,
     held: tuple[str, ...],
 ) -> tuple[Any, ...]:
-    """The fields of the intervals of one recording, each with `length` points."""
+    """The fields of the intervals of one recording, each padded to `length` points."""
     grid, ticks = points
     signals = loop.controller.signals(recording)
     kind, torque_kind = loop.stepping.interpolation, "linear"
@@ -153,10 +153,11 @@ def _drive(
 
 
 def held_names(recordings: Recordings | Sequence[Recording]) -> tuple[str, ...]:
-    """Names of the signals that hold from sample to sample, of all recordings together.
+    """Names of the signals that hold from sample to sample, in all recordings together.
 
-    **Raises:** `RecordingError` where one lacks a signal that another has. Drives of recordings
-    that do not say so are powered.
+    Drives of recordings without `on` count as powered.
+
+    **Raises:** `RecordingError` if one recording lacks a signal that another has.
     """
     names = tuple(dict.fromkeys(n for r in recordings for n in r.held_names))
     for r in recordings:
@@ -172,11 +173,11 @@ def held_names(recordings: Recordings | Sequence[Recording]) -> tuple[str, ...]:
 def held_at(
     recording: Recording, time: Float[np.ndarray, " times"], names: tuple[str, ...]
 ) -> dict[str, Float[np.ndarray, "times joints"]]:
-    """Signals that hold from sample to sample at any times, with drives powered if nothing is said.
+    """Signals that hold from sample to sample, at any times; drives are powered by default.
 
     **Arguments:**
 
-    - `names`: as `held_names` gives them.
+    - `names`: as returned by `held_names`.
     """
     found = recording.held_at(time)
     powered = np.ones((len(time), recording.joints))
@@ -202,7 +203,7 @@ def at_rest(recording: Recording) -> bool:
 
 
 def check_joints(loop: ClosedLoop, recording: Recording) -> None:
-    """Raises `RecordingError` where a recording has other joints than the loop."""
+    """Raises `RecordingError` if a recording's number of joints differs from the loop's."""
     if recording.joints != loop.joints:
         raise RecordingError(
             f"{recording.name} has {recording.joints} joints, but the robot {loop.name} has "
@@ -211,7 +212,7 @@ def check_joints(loop: ClosedLoop, recording: Recording) -> None:
 
 
 def check_law(loop: ClosedLoop) -> None:
-    """Raises `ModelError` where a controller's gains are those of other joints than the arm's."""
+    """Raises `ModelError` if a controller's gains do not match the number of joints of the arm."""
     n = loop.joints
 
     def command(zeros):
@@ -252,11 +253,11 @@ def prepare(
 
     **Arguments:**
 
-    - `loop`: which controller, and how to interpolate.
+    - `loop`: gives the controller and the interpolation.
     - `recordings`: with as many joints as the loop.
-    - `noise`: added to what the sensors read, `(samples, joints)` for each recording.
+    - `noise`: added to the sensor readings, `(samples, joints)` for each recording.
 
-    **Raises:** `RecordingError` where the joints do not match, `ModelError` from the controller.
+    **Raises:** `RecordingError` if the joints do not match, `ModelError` from the controller.
     """
     check_joints(loop, recordings[0])
     if noise is not None:
@@ -272,7 +273,7 @@ def prepare(
         for r, g, e in zip(recordings, grids, noises, strict=True)
     ]
     fields = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
-    # The structure is that of one interval; the values are where they belong already.
+    # The structure is that of one interval; the values are already in place.
     one = Interval(*jax.device_put(jax.tree.map(lambda leaf: leaf[0, 0], fields)))
     leaves = jax.tree.leaves(jax.device_put(fields))
     intervals = jax.tree.unflatten(jax.tree.structure(one), leaves)
@@ -303,7 +304,7 @@ def prepare(
 
 
 def band_of(loop: ClosedLoop, recordings: Recordings | Sequence[Recording]) -> Band | None:
-    """The part of the recordings' signals that the controller lets compare; None for all."""
+    """The part of the recordings' signals that is compared under the controller; None for all."""
     cutoffs = [loop.controller.comparable(r) for r in recordings]
     given = [c for c in cutoffs if c is not None]
     if len(given) < len(cutoffs):
@@ -317,7 +318,7 @@ def compared(
     recordings: Recordings | Sequence[Recording],
     signals: Sequence[Float[np.ndarray, "_samples joints"]],
 ) -> list[Float[np.ndarray, "_samples joints"]]:
-    """What of signals the controller lets compare, `(samples, joints)` for each recording.
+    """The part of signals that is compared under the controller, for each recording.
 
     **Arguments:**
 

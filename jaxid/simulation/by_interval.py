@@ -1,8 +1,8 @@
 """Solvers and step-size controllers that go from interval to interval between samples.
 
-Time is counted in intervals: from 0 where the first begins to the number of intervals. What drives
-the loop may have a kink or a jump from one to the next, so no step goes across; and it is looked up
-without a search.
+Time is counted in intervals, from 0 at the start of the first to the number of intervals. The
+inputs of the loop may have a kink or a jump between intervals, so no step crosses a boundary. With
+this unit of time they are looked up without a search.
 """
 
 import dataclasses
@@ -22,18 +22,18 @@ Scalars = tuple[Float[Array, ""], ...]
 
 
 # A flat state, `(states,)`, alone or with its tangents, `(states, columns)`; and the same row by
-# row, so that what is computed of a state is computed of scalars.
+# row, so that functions of a state become functions of scalars.
 Rows = PyTree[Float[Array, "..."]]
 Rate = Callable[[Interval, Float[Array, ""], Rows], Rows]
 
 
 def apart(y: PyTree[Array]) -> Rows:
-    """A state row by row."""
+    """Splits a state into its rows."""
     return jax.tree.map(tuple, y)
 
 
 def together(rows: Rows, like: PyTree[Array]) -> PyTree[Array]:
-    """Rows as a state like another."""
+    """Joins rows into a state with the structure of `like`."""
     kind = jax.tree.structure(like)
     return jax.tree.unflatten(kind, [jnp.stack(leaf) for leaf in kind.flatten_up_to(rows)])
 
@@ -47,13 +47,13 @@ def one_of(intervals: Interval, k: Int[Array, ""]) -> Interval:
 
 
 class Window(eqx.Module):
-    """Intervals in a row, from the one with number `first` on; leaves have `(intervals,)` first."""
+    """Consecutive intervals from number `first` on; leaves have the axis `(intervals,)` first."""
 
     intervals: Interval
     first: int | Int[Array, ""] = 0
 
     def at(self, t: Any) -> "Window":
-        """The one interval at a time; beyond the ends that at the end."""
+        """The interval that contains a time; beyond either end, the last one at that end."""
         count = self.intervals.h.shape[0]
         if count == 1:
             return self
@@ -63,7 +63,7 @@ class Window(eqx.Module):
 
 
 class WithinIntervals(diffrax.AbstractSolver):
-    """A solver all stages of whose steps are of the interval in which the step begins.
+    """A solver whose stages all use the interval in which the step begins.
 
     A stage may lie at the end of a step or, with some methods, beyond it.
     """
@@ -97,14 +97,14 @@ class WithinIntervals(diffrax.AbstractSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0: Any, t1: Any, y0, args, solver_state, made_jump):
-        """A step of the solver."""
+        """One step of the wrapped solver."""
         return self.solver.step(terms, t0, t1, y0, args.at(t0), solver_state, made_jump)
 
 
 class ThroughIntervals(diffrax.AbstractSolver):
-    """RK4 whose step is a whole interval: what drives the loop is looked up once for all of it.
+    """RK4 whose step is a whole interval, so that the loop's inputs are looked up once for it.
 
-    Within, the state is taken apart, and time is in seconds.
+    Within an interval the state is split into rows, and time is in seconds.
     """
 
     method: Any
@@ -114,7 +114,7 @@ class ThroughIntervals(diffrax.AbstractSolver):
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
     def order(self, terms) -> int:
-        """Of the method."""
+        """Order of the method."""
         return self.method.order(terms)
 
     def init(self, terms, t0, t1, y0, args) -> None:
@@ -191,17 +191,17 @@ class EqualSteps(diffrax.AbstractStepSizeController):
         self, t0: Any, t1: Any, y0, y1_candidate, args, y_error, error_order, state
     ):
         """The next step."""
-        # As after a jump, so that no solver takes over a slope from another interval.
+        # Reported as a jump, so that no solver reuses a slope from another interval.
         end = (state + 1) / self.count
         return True, t1, end, True, state + 1, diffrax.RESULTS.successful
 
 
 class CutSteps(diffrax.AbstractAdaptiveStepSizeController):
-    """Another controller's steps, cut where an interval ends.
+    """Another controller's steps, shortened to end where an interval ends.
 
     **Arguments:**
 
-    - `control`: the other, which thinks in seconds.
+    - `control`: the other controller, in seconds.
     - `start`, `length`: of the intervals, s; `length` is positive.
     - `first`: length of the first step that is tried, s.
     """
@@ -213,7 +213,7 @@ class CutSteps(diffrax.AbstractAdaptiveStepSizeController):
 
     @property
     def rtol(self):
-        """Of the other, from which an implicit solver takes it."""
+        """Relative tolerance of the other controller, which implicit solvers read."""
         return self.control.rtol
 
     @property
@@ -227,7 +227,7 @@ class CutSteps(diffrax.AbstractAdaptiveStepSizeController):
         return self.control.norm
 
     def wrap(self, direction):
-        """The same around the other as diffrax wraps it; time runs forward only."""
+        """This controller around the wrapped other one; time runs forward only."""
         return dataclasses.replace(self, control=self.control.wrap(direction))
 
     def _seconds(self, t: Time, interval: Int[Array, ""]) -> Time:
@@ -239,7 +239,7 @@ class CutSteps(diffrax.AbstractAdaptiveStepSizeController):
         return jnp.minimum(after, (interval + 1).astype(t.dtype))
 
     def init(self, terms, t0: Any, t1: Any, y0, dt0, args, func, error_order):
-        """The end of the first step, and the other's state."""
+        """The end of the first step, and the other controller's state."""
         begin, end = self.start[0], self.start[-1] + self.length[-1]
         then, state = self.control.init(terms, begin, end, y0, self.first, args, func, error_order)
         return self._within(t0, then - begin, jnp.asarray(0)), state

@@ -1,15 +1,15 @@
 """Decompositions of small matrices in a few array operations for each row.
 
-A call of LAPACK takes as long as the physics of a few joints, and keeps XLA from compiling the loop
-around it as one kernel. Measured on a SCARA with `jnp.linalg.solve` in its torque, 501 samples of
-4 steps, ms, these against LAPACK (no solve: 0.5 and 1.7):
+A LAPACK call takes as long as the physics of a few joints, and prevents XLA from compiling the loop
+around it as one kernel. Times in ms on a SCARA with `jnp.linalg.solve` in its torque, 501 samples
+of 4 steps, this module / LAPACK (without a solve: 0.5 and 1.7):
 
 | unknowns   | 2        | 4        | 6        | 8        | 10       |
 | simulation | 1.2 / 20 | 2.6 / 20 | 4.7 / 27 | 8.4 / 20 | 13 / 45  |
 | Jacobian   | 4.2 / 54 | 6.4 / 41 | 12 / 49  | 17 / 49  | 27 / 57  |
 
-Compiling takes 2 to 4 s longer, with 10 unknowns 8 s. Written out scalar by scalar, with a choice
-for each element of each row that may be the pivot, six unknowns take 12 and 22 ms.
+Compilation takes 2 to 4 s longer, with 10 unknowns 8 s. Written out scalar by scalar, with a
+selection for each element of each row that may be the pivot, six unknowns take 12 and 22 ms.
 """
 
 from collections.abc import Callable
@@ -19,12 +19,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-# Unknowns; more are LAPACK's.
+# Largest number of unknowns; larger systems go to LAPACK.
 MOST_ROWS = 8
 
 
 def decomposed(eqn, operands: list[Any]) -> tuple[Array, ...] | None:
-    """What one of JAX's primitives for small real matrices gives; None for any other equation."""
+    """Result of one of JAX's primitives for a small real matrix; None for any other equation."""
     name, matrix = eqn.primitive.name, operands[0] if operands else None
     if name not in _DECOMPOSITIONS or matrix is None or matrix.ndim != 2:
         return None
@@ -37,7 +37,7 @@ def decomposed(eqn, operands: list[Any]) -> tuple[Array, ...] | None:
 def _lu(
     _, a: Float[Array, "n n"]
 ) -> tuple[Float[Array, "n n"], Int[Array, " n"], Int[Array, " n"]]:
-    """Gaussian elimination with partial pivoting: factors, pivots and permutation as LAPACK's."""
+    """Gaussian elimination with partial pivoting; factors, pivots, permutation as in LAPACK."""
     n = a.shape[0]
     row = order = jnp.arange(n, dtype=jnp.int32)
     pivots = []
@@ -75,7 +75,7 @@ def _triangular_solve(
 
 
 def _cholesky(_, a: Float[Array, "n n"]) -> tuple[Float[Array, "n n"]]:
-    """The lower triangular factor; NaN from where the matrix is not positive definite."""
+    """The lower triangular factor; NaN from the first pivot that is not positive."""
     n, columns = a.shape[0], []
     for k in range(n):
         column = a[:, 0] / jnp.sqrt(a[0, 0])

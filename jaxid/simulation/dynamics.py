@@ -37,7 +37,7 @@ def settle(
     reference: Reference,
     label: Int[Array, ""],
 ) -> State:
-    """The state with the effects' own parts as the first command finds them: none ramps up."""
+    """The state with the effects' own states settled at the first command, so none ramps up."""
     seen = read(loop, state.q, state.v)
     mass = loop.arm.mass_matrix(state.q)
     tau = loop.controller.command(seen, reference, state.controller, mass)
@@ -54,18 +54,18 @@ def settle(
 
 
 def _sensor(loop: ClosedLoop, q: Float[Array, " joints"]) -> Float[Array, " joints"]:
-    """What sensors without steps report, `(joints,)`."""
+    """Reading of sensors with infinite resolution, `(joints,)`."""
     for effect in loop.effects:
         q = effect.read(q)
     return q
 
 
 def read(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Reading:
-    """What the sensors report at a position and velocity, `(joints,)`."""
+    """Sensor readings at a position and velocity, `(joints,)`."""
     seen, rate = jax.jvp(lambda position: _sensor(loop, position), (q,), (v,))
     if loop.resolution is not None:
         step = jnp.asarray(loop.resolution)
-        # Rounding has no slope; sensitivities go through as if the encoder were ideal.
+        # Rounding has zero derivative; sensitivities are those of an ideal encoder.
         seen = seen + jax.lax.stop_gradient(step * jnp.round(seen / step) - seen)
     return Reading(seen, rate)
 
@@ -73,13 +73,13 @@ def read(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"
 def behind(
     loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]
 ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
-    """Position and velocity at which the sensors report these, `(joints,)` each."""
+    """Position and velocity at which the sensors give these readings, `(joints,)` each."""
     if all(type(effect).read is AbstractEffect.read for effect in loop.effects):
         return q, v
 
     def position(reading: Float[Array, " joints"]) -> Float[Array, " joints"]:
         guess = reading
-        # Errors of sensors are some hundredths of what they read: each turn gains two digits.
+        # Sensor errors are some hundredths of the reading, so each iteration gains two digits.
         for _ in range(6):
             guess = guess + reading - _sensor(loop, guess)
         return guess
@@ -105,11 +105,11 @@ def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Fl
 
 
 class Outside(eqx.Module):
-    """What comes from outside the loop at one instant; vectors are `(joints,)`.
+    """External inputs of the loop at one instant; vectors are `(joints,)`.
 
-    `push` is torque on the drives, `pull` on the links (the same where nothing gives way between
-    them and nothing depends on the load), `noise` is added to what the sensors read, and
-    `noise_rate` is how fast that of velocity changes.
+    `push` is torque on the drives, `pull` on the links (the two are equivalent if the transmission
+    is rigid and nothing depends on the load). `noise` is added to the sensor readings, and
+    `noise_rate` is the rate of change of the velocity noise.
     """
 
     push: Float[Array, " joints"]
@@ -119,9 +119,9 @@ class Outside(eqx.Module):
 
 
 class Instant(eqx.Module):
-    """Everything about one instant of the loop; vectors are `(joints,)`.
+    """All quantities at one instant of the loop; vectors are `(joints,)`.
 
-    `command` is what the controller asks for and what gets recorded, `tau` what the drives
+    `command` is the controller's output, which is recorded, `tau` the torque that the drives
     deliver, `a` the acceleration of the drives.
     """
 
@@ -142,18 +142,18 @@ def effect_loads(
     curves: bool = True,
     inertia: bool = True,
 ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
-    """Torque that all effects together ask of the drives, and that of the links, `(joints,)` each.
+    """Torque that all effects require of the drives, and that of the links, `(joints,)` each.
 
-    Effects of the load come last, since they are given what the others leave of the torque. What is
-    proportional to acceleration, which is solved for, is not taken off.
+    Load-dependent effects come last, since they depend on the torque less all others. Acceleration
+    is solved for, so terms proportional to it are not subtracted.
 
     **Arguments:**
 
-    - `motion`: of the drives. `states`: the effects' own. `links`: their motion, where they part
-      from the drives.
-    - `push`: torque on the drives from outside, which effects of the load see.
-    - `curves`: False to leave out what needs an acceleration that is not known yet.
-    - `inertia`: False to leave out what is proportional to acceleration.
+    - `motion`: of the drives. `states`: the effects' own. `links`: the links' motion, if it differs
+      from the drives'.
+    - `push`: external torque on the drives, which load-dependent effects include.
+    - `curves`: False to leave out effects that need an acceleration that is not known yet.
+    - `inertia`: False to leave out terms proportional to acceleration.
     """
     drive = link = ahead = jnp.zeros_like(motion.v)
     behind = motion if links is None else links
@@ -188,7 +188,7 @@ def effect_loads(
 def link_load(
     loop: ClosedLoop, links: Motion, states: tuple[Float[Array, " _"], ...]
 ) -> Float[Array, " joints"]:
-    """Torque that the links take at their position and velocity without accelerating, `(joints,)`.
+    """Torque that the links need at their position and velocity without accelerating, `(joints,)`.
 
     **Arguments:**
 
@@ -204,7 +204,7 @@ def link_load(
 def inverse(
     loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...]
 ) -> Float[Array, " joints"]:
-    """Torque at the joints that a motion takes (the inverse dynamic model), `(joints,)`."""
+    """Torque at the joints that a motion needs (the inverse dynamic model), `(joints,)`."""
     drive, link = effect_loads(loop, motion, states)
     return loop.arm.inverse(motion.q, motion.v, motion.a) + drive + link
 
@@ -233,14 +233,14 @@ def instant(
     outside: Outside,
     label: Int[Array, ""],
 ) -> Instant:
-    """The closed loop at one instant: what is read, commanded and delivered, and what follows.
+    """The closed loop at one instant: readings, command, delivered torque and accelerations.
 
     **Arguments:**
 
     - `t`: time, s.
     - `state`: of the loop.
-    - `reference`: what the controller is asked for.
-    - `outside`: what acts on it.
+    - `reference`: of the controller.
+    - `outside`: external inputs.
     - `label`: which recording.
     """
     if imposed(loop):
@@ -257,7 +257,7 @@ def instant(
     tau = loop.controller.acting(command, state.controller)
     still, none = jnp.zeros_like(state.q), jnp.zeros(0)
     motion = Motion(t, state.q, state.v, still, tau, none, label, reference.held)
-    # An effect's own states see what arrives at it, so that lags in a row compose.
+    # An effect's own states depend on the signal at its input, so that lags in series compose.
     arriving = []
     for effect, own in zip(loop.effects, state.effects, strict=True):
         arriving.append(motion.tau)
@@ -276,10 +276,10 @@ def instant(
 
 
 def imposed(loop: ClosedLoop) -> bool:
-    """Whether the motion is the reference itself, so that nothing of it needs to be simulated.
+    """Whether the motion is the reference itself, so that it need not be simulated.
 
-    It is under a law that imposes it, but for effects that give the arm a motion of its own and for
-    drives that do more to a command than multiply it, whose command cannot be told from its torque.
+    This is so if the law imposes the motion, unless an effect gives the arm a motion of its own or
+    a drive does more than multiply its command, so that the command does not follow from torque.
     """
     return loop.controller.imposes and not any(
         isinstance(effect, AbstractTransmission)
@@ -289,7 +289,7 @@ def imposed(loop: ClosedLoop) -> bool:
 
 
 def _drives(effect: AbstractEffect) -> bool:
-    """Whether it makes something else of a command."""
+    """Whether the effect changes a command."""
     return type(effect).command is not AbstractEffect.command
 
 
@@ -332,7 +332,7 @@ def _commanded(
             command = effect.command(dataclasses.replace(motion, tau=command))
         return command
 
-    # Each joint's gain is its own.
+    # The gains of the joints are independent.
     return tau / delivered(jnp.ones_like(tau))
 
 
@@ -343,10 +343,10 @@ def _beside_bodies(
     rigid: Float[Array, " joints"],
     outside: Outside,
 ) -> Float[Array, " joints"]:
-    """What a motion takes beside `rigid`, on the arm's bodies, less what comes from outside."""
+    """Torque that a motion needs in addition to `rigid`, less external torque."""
     helped = outside.push + outside.pull
     if any(effect.loaded for effect in loop.effects):
-        # What depends on the load is given the torque that the motion takes without it.
+        # Load-dependent effects get the torque that the motion needs without them.
         pairs = zip(loop.effects, state.effects, strict=True)
         kept = [(e, s) for e, s in pairs if not e.loaded]
         others = loop.with_effects([e for e, _ in kept])
@@ -359,7 +359,7 @@ def _beside_bodies(
 def _accelerations(
     loop: ClosedLoop, motion: Motion, state: State, outside: Outside
 ) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
-    """Accelerations of the drives, and of the twist of each transmission by its place."""
+    """Accelerations of the drives, and of each transmission's twist, by the effect's index."""
     added = _added_inertia(loop, motion, state.effects)
     matrix = loop.arm.mass_matrix(state.q) + added
     bias = loop.arm.bias(state.q, state.v)
@@ -373,7 +373,7 @@ def _accelerations(
     ]
     if transmissions:
         return _through_transmissions(loop, motion, state, transmissions, outside, added)
-    # What is proportional to acceleration is on the left-hand side already.
+    # Terms proportional to acceleration are already on the left-hand side.
     drive, link = effect_loads(loop, motion, own, push=outside.push, inertia=False)
     torque = motion.tau - drive - link + outside.push + outside.pull
     return solve_positive(matrix, torque - bias), {}
@@ -422,6 +422,6 @@ def sizes(loop: ClosedLoop) -> list[int]:
 
 
 def unflatten(loop: ClosedLoop) -> Callable[[Float[Array, " states"]], State]:
-    """The function that makes a state of a flat vector, `(states,)`."""
+    """The function that converts a flat vector, `(states,)`, to a state."""
     zeros = jnp.zeros(loop.joints)
     return ravel_pytree(rest(loop, zeros, zeros))[1]

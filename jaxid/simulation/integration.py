@@ -1,7 +1,7 @@
-"""A loop through the intervals of a recording, by diffrax.
+"""Integration of a loop through the intervals of a recording, by diffrax.
 
-Time is counted in intervals here (see `by_interval`), so that what drives the loop is looked up
-without a search, and intervals of no length, which pad recordings, leave the state alone.
+Time is counted in intervals here (see `by_interval`), so that the loop's inputs are looked up
+without a search, and intervals of zero length, which pad recordings, leave the state unchanged.
 """
 
 import dataclasses
@@ -52,7 +52,7 @@ SIGNALS = ("tau", "q", "v", "a", "delivered")
 
 
 def _line(ends: Float[Array, "2 joints"] | None, dt, h, joints: int) -> Float[Array, " joints"]:
-    """A line between its two ends, after a time from the first."""
+    """Linear interpolation between two ends, at a time after the first."""
     if ends is None:
         return jnp.zeros(joints)
     return ends[0] + dt * (ends[1] - ends[0]) / jnp.where(h > 0, h, 1.0)
@@ -111,7 +111,7 @@ def observe(
         seen = (now.command, now.reading.q, now.reading.v, now.a, now.tau)
         return ravel_pytree(state)[0], jnp.stack([seen[row] for row in rows])
 
-    # Along a motion that is given, instants are independent, and arrays of many at once.
+    # Along a given motion the instants are independent, and are computed as arrays of many.
     return begin(interval, x) if imposed(loop) else unrolled(begin, interval, x)(interval, x)
 
 
@@ -119,7 +119,7 @@ def observe(
 
 
 def _rate(loop: ClosedLoop, intervals: Interval, x: Float[Array, " states"]) -> Rate:
-    """The loop's equations, 1/s, written out: of an interval, a time within it and a state."""
+    """The loop's equations, 1/s, unrolled: a function of an interval, a time in it and a state."""
     unravel = unflatten(loop)
 
     def rate(interval: Interval, t: Float[Array, ""], y: Scalars) -> Scalars:
@@ -135,12 +135,12 @@ def _rate(loop: ClosedLoop, intervals: Interval, x: Float[Array, " states"]) -> 
 def with_tangents(
     fun: Callable[..., Any], loop: ClosedLoop, columns: int
 ) -> Callable[..., tuple[Any, Any]]:
-    """A function of a loop and a state, with its derivatives: of a state and its tangents.
+    """A function of a state and its tangents that returns `fun` with its derivatives.
 
     **Arguments:**
 
-    - `fun`: of a loop with some parameters and a state.
-    - `columns`: tangents; the first are by the loop's free parameters.
+    - `fun`: a function of a loop with some parameters and of a state.
+    - `columns`: number of tangents; the first are by the loop's free parameters.
     """
     theta = loop.theta
     directions = jnp.eye(theta.shape[0], columns)
@@ -211,12 +211,12 @@ def integrate(
 ) -> tuple[Float[Array, "points states"], Int[Array, ""]]:
     """One solve through all intervals: the states at grid points, and how it ended.
 
-    From where a solve fails on, states are infinite.
+    After a failure of the solve, states are infinite.
 
     **Arguments:**
 
-    - `intervals`: between grid points; the last, which has no length, ends the run.
-    - `substeps`: in place of the settings' own, for programs that serve any number of them.
+    - `intervals`: between grid points; the last, which has zero length, ends the run.
+    - `substeps`: replaces the number in the settings, for programs that serve any number.
     """
     if given(loop):
         return states_of_reference(loop, intervals, x0), success()
@@ -256,13 +256,13 @@ def integrate_with_tangents(
 ) -> tuple[Float[Array, "points states"], Float[Array, "points states columns"]]:
     """`integrate` with the derivative of every state, for RK4 with fixed steps.
 
-    The sensitivity equations go through RK4 beside the state. For fixed steps that is the exact
-    derivative of the discrete run, as forward mode through the solve gives it, and takes half as
-    long to trace: forward mode and `vmap` would each go through all of diffrax again.
+    RK4 integrates the sensitivity equations together with the state. For fixed steps this is the
+    exact derivative of the discrete run, equal to forward mode through the solve. It takes half as
+    long to trace, since forward mode and `vmap` would each trace all of diffrax again.
     """
     through = jax.tree.map(lambda leaf: leaf[:-1], intervals)
 
-    # As a part of its own, since diffrax traces a step several times.
+    # A separately jitted function, since diffrax traces a step several times.
     @jax.jit
     def rate(interval, t, rows):
         def plain(loop, x):
@@ -274,7 +274,7 @@ def integrate_with_tangents(
 
 
 def _at_steps(loop, rate, through, y0, substeps=None):
-    """States at grid points where a step is an interval: no interpolation, and no step can fail."""
+    """States at grid points if a step is an interval: no interpolation, and no step can fail."""
     ys = _solve(loop, rate, through, y0, diffrax.SaveAt(steps=True), substeps).ys
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), y0, ys)
 
@@ -286,18 +286,18 @@ def through_interval(
     substeps: int | Int[Array, ""] | None = None,
     alive: Bool[Array, ""] | None = None,
 ) -> tuple[Float[Array, " states"], Int[Array, ""]]:
-    """The state at an interval's end, not a number where the solve fails, and how it ended.
+    """The state at an interval's end, NaN if the solve fails, and how it ended.
 
     **Arguments:**
 
-    - `alive`: False where there is nothing left to solve.
+    - `alive`: False if there is nothing left to solve.
     """
     if given(loop):
         return x, success()
     alone = jax.tree.map(lambda leaf: leaf[None], interval)
     rate = _rate(loop, alone, x)
     if loop.stepping.plain:
-        # One step, which cannot fail: a solve around it would only take longer to compile.
+        # One step cannot fail, and a solve around it would only take longer to compile.
         count = _substeps(loop, substeps)
         solver = ThroughIntervals(loop.stepping.solver, rate, count)
         start = jnp.zeros(())
@@ -319,12 +319,12 @@ def _substeps(loop: ClosedLoop, given: int | Int[Array, ""] | None) -> int | Int
 
 
 def success() -> Int[Array, ""]:
-    """The number of a result that is none of the reasons to fail."""
+    """The result number of a successful solve."""
     return jnp.zeros((), jnp.int32)
 
 
 def unless_finite(code: Int[Array, ""], values: Float[Array, "..."]) -> Int[Array, ""]:
-    """The number of a result, that of values which are not finite where nothing else is wrong."""
+    """The result number; that for values that are not finite if nothing else is wrong."""
     bad = ~jnp.all(jnp.isfinite(values))
     return jnp.where((code == 0) & bad, _number(diffrax.RESULTS.nonfinite), code)
 
@@ -335,6 +335,6 @@ def _number(result: Any) -> Int[Array, ""]:
 
 
 def reason(code: int | np.integer | Int[Array | np.ndarray, ""]) -> str:
-    """Why a solve failed, in diffrax's words; empty where it did not."""
+    """Why a solve failed, in diffrax's words; empty if it did not."""
     kind = jax.tree.structure(diffrax.RESULTS.successful)
     return diffrax.RESULTS[jax.tree.unflatten(kind, [np.asarray(code)])]

@@ -1,7 +1,7 @@
-"""What keeps XLA from compiling a loop as one kernel on a CPU, avoided where that pays.
+"""Operations that prevent XLA from compiling a loop as one kernel on a CPU, and replacements.
 
-A loop whose body holds a product of matrices, a call of LAPACK, a sort or the like is run
-operation by operation, and each costs as much as the whole physics of a few joints.
+A loop whose body contains a matrix product, a LAPACK call, a sort or the like is run operation by
+operation, and each operation costs as much as the whole physics of a few joints.
 """
 
 import math
@@ -17,8 +17,8 @@ from jaxtyping import Array
 
 from ..errors import JaxidWarning
 
-# XLA's rule (`small_while_loop_hoisting_pass.cc`) by the primitives that come to such operations;
-# each was found so in a compiled Jacobian, and convolutions, searches and `argmax` were not.
+# XLA's rule (`small_while_loop_hoisting_pass.cc`), as JAX primitives that lower to such operations.
+# Each was confirmed in a compiled Jacobian; convolutions, searches and `argmax` were not affected.
 _SPLITTING = frozenset(
     """
     cholesky dot_general eig eigh fft geqrf householder_product io_callback lu pure_callback qr
@@ -26,17 +26,18 @@ _SPLITTING = frozenset(
     triangular_solve tridiagonal tridiagonal_solve
     """.split()  # noqa: SIM905
 )
-# Up to these sizes products of matrices are written as sums of columns. Measured on a SCARA with a
-# network of two hidden layers in its torque, 501 samples of 4 steps, ms, sums against products (no
-# network: 0.5 and 1.7): simulation 1.5 against 1.7 with layers of 16 and 2.6 against 2.5 with
-# layers of 32, Jacobian 9 against 41 and 30 against 60. Written out scalar by scalar the larger one
-# took 9 and 185 ms. One reduction over all columns takes 6 ms for the smaller one's Jacobian, but
-# 340 with 49 parameters, where XLA takes it out of the kernel; sums of columns then take 100.
+# Up to these sizes matrix products are written as sums of columns. Times in ms on a SCARA with a
+# network of two hidden layers in its torque, 501 samples of 4 steps, sums against products (without
+# a network: 0.5 and 1.7): simulation 1.5 against 1.7 with layers of 16 and 2.6 against 2.5 with
+# layers of 32, Jacobian 9 against 41 and 30 against 60. Written out scalar by scalar, the larger
+# network took 9 and 185 ms. One reduction over all columns takes 6 ms for the smaller network's
+# Jacobian, but 340 with 49 parameters, where XLA moves it out of the kernel; sums of columns then
+# take 100.
 _MOST_PRODUCTS, _DEEPEST = 1024, 64
 
 
 def plain_product(params, dtype) -> bool:
-    """Whether a product is one of numbers in the usual arithmetic, summed as wide as they are."""
+    """Whether a product names no algorithm and accumulates in a type that holds its operands."""
     wanted = params["preferred_element_type"] or dtype
     precision = params["precision"]
     usual = precision is None or isinstance(precision, (tuple, jax.lax.Precision))
@@ -46,7 +47,7 @@ def plain_product(params, dtype) -> bool:
 def summed_product(eqn, operands: list[Any]) -> tuple[Array] | None:
     """A small product with a matrix as a sum of products of columns; None for any other.
 
-    Products of two vectors are sums to XLA already.
+    XLA already compiles products of two vectors as sums.
     """
     if eqn.primitive.name != "dot_general" or not _summed(eqn):
         return None
@@ -68,7 +69,7 @@ def summed_product(eqn, operands: list[Any]) -> tuple[Array] | None:
 
 
 def _summed(eqn) -> bool:
-    """Whether the sizes of a product are those that are written as sums."""
+    """Whether a product is small enough to be written as sums."""
     params, out = eqn.params, eqn.outvars[0].aval
     (contracted, _), batch = params["dimension_numbers"]
     depth = math.prod(eqn.invars[0].aval.shape[d] for d in contracted)
@@ -80,17 +81,17 @@ def _summed(eqn) -> bool:
     )
 
 
-# Whom it was said of: a fit compiles half a dozen programs of one loop.
+# Functions already warned about, since a fit compiles half a dozen programs of one loop.
 _SAID: set[str] = set()
 
 
 def say_what_splits(eqn, origin) -> None:
-    """Warns, once for each function of the model, of what a loop's kernel cannot hold.
+    """Warns, once per function of the model, of an operation that a loop's kernel cannot contain.
 
     **Arguments:**
 
     - `eqn`: an equation that is evaluated with whole arrays.
-    - `origin`: the equation that it is a part of, which knows where it was written.
+    - `origin`: the equation that it is a part of, which has the source location.
     """
     found = _splitting(eqn)
     if found is None or jax.default_backend() != "cpu":
@@ -109,11 +110,11 @@ def say_what_splits(eqn, origin) -> None:
 
 
 def _splitting(eqn) -> str | None:
-    """The name of an operation in an equation that a kernel cannot hold."""
+    """The name of an operation in an equation that a kernel cannot contain."""
     name = eqn.primitive.name
     if name == "dot_general" and eqn.outvars[0].aval.size == 1:
         return None
-    # One window is put in its place like a slice.
+    # A single window is updated like a slice.
     if name.startswith("scatter") and math.prod(eqn.invars[1].aval.shape[:-1]) == 1:
         return None
     if name in _SPLITTING:

@@ -33,10 +33,10 @@ class ClosedLoop(eqx.Module):
 
     - `arm`: rigid bodies.
     - `controller`: acts on what the sensors read.
-    - `effects`: friction and whatever else; the order is that of the signal through the drive.
-    - `name`: how results call the robot.
-    - `held`: places of parameters that fits leave at their values; names are turned into places.
-    - `freed`: places of those that fits estimate although they are not free by declaration.
+    - `effects`: friction and others, in the order in which the signal passes through the drive.
+    - `name`: name of the robot in results.
+    - `held`: places of parameters that fits hold fixed; names are converted to places.
+    - `freed`: places of parameters that fits estimate although they are not free by default.
     - `resolution`: step of the simulated encoders, `(joints,)`, rad or m; None for ideal ones.
     - `stepping`: how it is integrated.
     """
@@ -45,14 +45,14 @@ class ClosedLoop(eqx.Module):
     controller: AbstractController
     effects: tuple[AbstractEffect, ...] = eqx.field(default=(), converter=tuple)
     name: str = eqx.field(static=True, default="robot")
-    # By place, for a name may become another's as effects come and go.
+    # By place, since a name may pass to another parameter when effects are added or removed.
     held: frozenset[Place] = eqx.field(static=True, default=frozenset(), converter=frozenset)
     freed: frozenset[Place] = eqx.field(static=True, default=frozenset(), converter=frozenset)
     resolution: tuple[float, ...] | None = eqx.field(static=True, default=None)
     stepping: Stepping = Stepping()
 
     def __post_init__(self):
-        # Here converters have not run yet.
+        # Converters have not run yet at this point.
         self.effects = tuple(self.effects)
         self.held, self.freed = self._places(self.held), self._places(self.freed)
 
@@ -74,7 +74,7 @@ class ClosedLoop(eqx.Module):
 
     @property
     def joints(self) -> int:
-        """How many joints the arm has."""
+        """Number of joints of the arm."""
         return self.arm.joints
 
     @property
@@ -93,7 +93,7 @@ class ClosedLoop(eqx.Module):
 
     @property
     def held_names(self) -> frozenset[str]:
-        """Names of the parameters that fits leave at their values on request."""
+        """Names of the parameters that fits hold fixed on request."""
         return frozenset(p.name for p in self.parameters if p.place in self.held)
 
     @property
@@ -107,7 +107,7 @@ class ClosedLoop(eqx.Module):
         return tuple(name for p in self.free_parameters for name in p.names)
 
     def unit(self, parameter: Parameter) -> str:
-        """A parameter's unit, where its joint slides in m and N."""
+        """A parameter's unit; in m and N if its joint slides."""
         unit, joint = parameter.declaration.unit, parameter.joint
         slides = joint is not None and self.arm.prismatic()[joint - 1]
         return sliding_unit(unit) if slides else unit
@@ -120,7 +120,7 @@ class ClosedLoop(eqx.Module):
     def with_theta(self, theta: Vector) -> "ClosedLoop":
         """The same loop with other values for its free parameters, `(parameters,)`.
 
-        **Raises:** `ModelError` where they are not as many.
+        **Raises:** `ModelError` if the number of values differs.
         """
         parameters = self.free_parameters
         count = sum(p.size for p in parameters)
@@ -139,7 +139,7 @@ class ClosedLoop(eqx.Module):
         return set_by_name(self, **values)
 
     def hold(self, *names: str, **values: float) -> "ClosedLoop":
-        """The same loop with parameters that fits leave alone, at given values if there are any.
+        """The same loop with parameters that fits hold fixed, at the given values if any.
 
         **Raises:** `ModelError` for a name it does not have.
         """
@@ -173,9 +173,9 @@ class ClosedLoop(eqx.Module):
         return dataclasses.replace(self, effects=(*self.effects, *effects))
 
     def with_effects(self, effects: Iterable[AbstractEffect]) -> "ClosedLoop":
-        """The same loop with these effects; what is held or freed stays so with its effect.
+        """The same loop with these effects; held and freed parameters of kept effects stay so.
 
-        A parameter's name may change as another of its kind comes or goes.
+        A parameter's name may change if another of its kind is added or removed.
         """
         after = tuple(effects)
         left = list(enumerate(after))
@@ -196,7 +196,7 @@ class ClosedLoop(eqx.Module):
         )
 
     def without(self, name: str, joint: int | None = None) -> "ClosedLoop":
-        """The same loop without the effects of a name, on one joint or on all.
+        """The same loop without the effects of a given name, on one joint or on all.
 
         **Arguments:**
 
@@ -221,7 +221,7 @@ class ClosedLoop(eqx.Module):
 
     @classmethod
     def fields_of_format(cls, fields: dict[str, Any], written: int) -> dict[str, Any]:
-        """Fields of a saved loop of an older format: what is held or freed by its name of now."""
+        """Fields of a saved loop of an older format, held and freed names converted to new ones."""
 
         def named(one: str | Place) -> str | Place:
             if isinstance(one, str):
@@ -236,7 +236,7 @@ class ClosedLoop(eqx.Module):
         }
 
     def of_format(self, written: int) -> "ClosedLoop":
-        """The loop of a saved result of an older format: the first held and freed names."""
+        """The loop of a saved result of an older format; the first format held and freed names."""
         return dataclasses.replace(self) if written == 1 else self
 
     def _repr_html_(self) -> str:
@@ -265,7 +265,7 @@ class ClosedLoop(eqx.Module):
 
 
 def _row(loop: ClosedLoop, p: Parameter) -> tuple[str, ...]:
-    """A parameter's line in the loop's table: name, value, unit, bounds, whether fits leave it."""
+    """A parameter's row in the loop's table: name, value, unit, bounds, whether it is held."""
     low, high = p.declaration.lower, p.declaration.upper
     bounds = [f"≥ {low:g}" if low > -math.inf else "", f"≤ {high:g}" if high < math.inf else ""]
     value = "several" if p.several else f"{float(p.where(loop)):.4g}"

@@ -1,4 +1,4 @@
-"""Operations that only move numbers, done to arrays of scalars when a program is written.
+"""Operations that only move elements, applied to arrays of scalars while a program is traced.
 
 Each takes the parameters of JAX's primitive and object arrays.
 """

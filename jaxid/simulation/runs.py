@@ -32,10 +32,10 @@ from .steps import set_substeps, with_forward_mode, with_rolled_stages, with_sub
 class Simulated(eqx.Module):
     """Signals of one simulation at the samples, `(samples, joints)`, in SI units.
 
-    `q` and `v` are what the sensors read, `tau` the commanded torque as it is recorded, `a` the
+    `q` and `v` are the sensor readings, `tau` the commanded torque as it is recorded, `a` the
     acceleration of the drives and `delivered` their torque. `states` is the whole state,
-    `(samples, states)`. `result` is zero where the solve succeeded; `jaxid.simulation.reason` says
-    what other numbers mean. It is None for signals that were not simulated.
+    `(samples, states)`. `result` is zero if the solve succeeded; `jaxid.simulation.reason` explains
+    other numbers. It is None for signals that were not simulated.
     """
 
     time: Float[Array | np.ndarray, "*batch samples"]
@@ -53,7 +53,7 @@ class Sensitivities(eqx.Module):
 
     - `seen`, `slopes`: signals and their derivatives at every grid point.
     - `end`, `end_slopes`: the state at the last grid point and its derivatives.
-    - `result`: zero where the solve succeeded, see `reason`.
+    - `result`: zero if the solve succeeded, see `reason`.
     """
 
     seen: Float[Array, "points rows joints"]
@@ -68,7 +68,7 @@ BY_SAMPLE = ("time", "q", "v", "a", "tau", "delivered", "states")
 
 
 def each(fun: Callable, *args):
-    """The function of every recording: one after the other on a CPU, together on an accelerator.
+    """Maps a function over recordings: sequentially on a CPU, as one batch on an accelerator.
 
     One recording's states stay in a core's registers and first cache; a batch's do not.
 
@@ -92,11 +92,11 @@ def run(
 
     **Arguments:**
 
-    - `substeps`: for programs that serve any number of them; None for the loop's own.
+    - `substeps`: for programs that serve any number of substeps; None for the loop's own.
     - `rows`: which of `SIGNALS`.
 
-    **Returns:** states, signals, and the number of the result: zero is success, see `reason`.
-    From where a solve failed on, nothing is finite.
+    **Returns:** states, signals, and the result number: zero is success, see `reason`. After a
+    failure of the solve, states and signals are not finite.
     """
     if loop.controller.period is not None:
         states, seen, code = _ticking(loop, intervals, x0, substeps, rows)
@@ -107,12 +107,12 @@ def run(
 
 
 def _at_points(loop: ClosedLoop, fun: Callable, *args):
-    """A function of every grid point, all together where the motion is given."""
+    """Maps a function over grid points, as one batch if the motion is given."""
     return jax.vmap(fun)(*args) if imposed(loop) else each(fun, *args)
 
 
 def _ticking(loop, intervals, x0, substeps, rows):
-    """A run under a sampled law: interval by interval, since it acts between two of them."""
+    """A run under a sampled law, interval by interval, since the law acts between intervals."""
 
     def body(carry, interval):
         x, code = carry
@@ -131,15 +131,15 @@ def _ticking(loop, intervals, x0, substeps, rows):
 def advance(
     loop: ClosedLoop, interval: Interval, x: Float[Array, " states"]
 ) -> tuple[Float[Array, " states"], Float[Array, "5 joints"], Int[Array, ""]]:
-    """One interval: the state at its end, what is to be seen at its start, and the result.
+    """One interval: the state at its end, the signals at its start, and the result.
 
     **Arguments:**
 
-    - `interval`: what drives the loop.
+    - `interval`: the inputs of the loop.
     - `x`: the state at its start, flat, `(states,)`.
 
-    **Returns:** the state, `(states,)`, the rows of `SIGNALS`, `(5, joints)`, and the number of the
-    result.
+    **Returns:** the state, `(states,)`, the rows of `SIGNALS`, `(5, joints)`, and the result
+    number.
     """
     held, seen = observe(loop, interval, x, tuple(range(5)))
     after, code = through_interval(loop, interval, held)
@@ -155,12 +155,12 @@ def run_with_sensitivities(
 ) -> Sensitivities:
     """One run, and the exact derivative of its signals by the loop's free parameters.
 
-    All tangents go through the run together, each stage of each step for all at once.
+    All tangents are integrated together: each stage of each step is computed for all at once.
 
     **Arguments:**
 
     - `intervals`, `x0`: as in `run`.
-    - `start`: derivative of `x0` by the parameters, and by whatever columns come after them,
+    - `start`: derivative of `x0` by the parameters, and by any further columns,
       `(states, columns)`.
     - `rows`: which of `SIGNALS`.
     """
@@ -209,18 +209,18 @@ def simulate(
     *,
     noise: Sequence[np.ndarray] | None = None,
 ) -> tuple[Simulated, ...]:
-    """Simulates the loop along recordings: their references, their initial states.
+    """Simulates the loop along recordings, with their references and initial states.
 
     **Arguments:**
 
     - `loop`: the model.
-    - `recordings`: where references and initial states come from.
-    - `noise`: added to what the sensors read, `(samples, joints)` for each recording; it goes
-      round the loop.
+    - `recordings`: give references and initial states.
+    - `noise`: added to the sensor readings, `(samples, joints)` for each recording; it is fed back
+      through the controller.
 
     **Returns:** one `Simulated` for each recording.
 
-    **Raises:** `RecordingError` or `ModelError` where the two do not fit together.
+    **Raises:** `RecordingError` or `ModelError` if loop and recordings do not match.
     """
     recordings = Recordings.of(recordings)
     batch = prepare(loop, recordings, noise)
@@ -231,7 +231,7 @@ def simulate(
 def by_recording(
     together: Simulated, recordings: Recordings | Sequence[Recording]
 ) -> tuple[Simulated, ...]:
-    """The runs of a batch, `(recordings, samples, ...)`, one by one with their own samples."""
+    """Splits the runs of a batch, `(recordings, samples, ...)`, without the padding."""
     return tuple(
         jax.tree.map(
             lambda leaf, k=k, r=r: np.asarray(leaf[(k, slice(r.samples))[: np.ndim(leaf)]]),
@@ -246,7 +246,7 @@ def simulate_batch(loop: ClosedLoop, batch: Batch) -> Simulated:
     substeps = None
     forward = isinstance(loop.stepping.adjoint, diffrax.ForwardMode)
     if loop.stepping.control is None and forward:
-        # One program for any number of steps: refining them need not compile again.
+        # One program for any number of steps, so that refining them needs no compilation.
         substeps = jnp.asarray(loop.stepping.substeps or 1)
         loop = set_substeps(loop, None, settled=False)
     return jax.device_get(_simulate(loop, batch, substeps))

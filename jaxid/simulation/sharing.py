@@ -1,4 +1,4 @@
-"""Recordings shared out: over the cores of this machine, or over the devices of a mesh."""
+"""Distribution of recordings over the cores of this machine or the devices of a mesh."""
 
 import math
 import os
@@ -19,7 +19,7 @@ Result = TypeVar("Result")
 
 
 def cores() -> int:
-    """How many cores this process may use; one where an accelerator does the work."""
+    """Number of cores that this process may use; one if an accelerator does the work."""
     if jax.default_backend() != "cpu":
         return 1
     known = hasattr(os, "sched_getaffinity")
@@ -27,13 +27,13 @@ def cores() -> int:
 
 
 def of_this_machine(mesh: Mesh) -> bool:
-    """Whether a mesh has host devices of this process only: threads by another name."""
+    """Whether a mesh has only host devices of this process, which are no more than threads."""
     here = jax.process_index()
     return all(d.platform == "cpu" and d.process_index == here for d in mesh.devices.flat)
 
 
 def shares_of(count: int, parts: int) -> list[Int[np.ndarray, " rows"]]:
-    """Which recordings each of `parts` takes: as many each, the last again where they run out."""
+    """Recordings of each of `parts`: equally many, padded by repeating the last."""
     size = -(-count // min(parts, count))
     return [np.minimum(np.arange(k, k + size), count - 1) for k in range(0, count, size)]
 
@@ -41,7 +41,7 @@ def shares_of(count: int, parts: int) -> list[Int[np.ndarray, " rows"]]:
 def at_once(
     fun: Callable[[Given], Result], parts: Sequence[Given], threads: int | None = None
 ) -> list[Result]:
-    """The function of each part, by some threads; as many as there are cores if not said.
+    """Applies the function to each part, on several threads; by default one per core.
 
     XLA runs a loop on the core of its caller, and compiles without holding Python's lock.
     """
@@ -52,14 +52,14 @@ def at_once(
 
 
 def taken(each: PyTree, rows: Int[np.ndarray, " rows"]) -> PyTree:
-    """These rows of the leading axis of every leaf."""
+    """The given rows of the leading axis of every leaf."""
     return jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[rows], each))
 
 
 class EndToEnd:
-    """Room for the leaves of all parts, which lie end to end along their leading axes.
+    """Preallocated arrays for the leaves of all parts, concatenated along their leading axes.
 
-    Parts are put in place as they come, so that what is large is neither held nor copied twice.
+    Each part is copied in when it is ready, so that large arrays are not held or copied twice.
     """
 
     def __init__(self, parts: int):
@@ -68,7 +68,7 @@ class EndToEnd:
         self._lock = threading.Lock()
 
     def put(self, part: int, result: PyTree) -> None:
-        """Takes the result of one part; every part has leaves of the same shapes."""
+        """Stores the result of one part; every part has leaves of the same shapes."""
         with self._lock:
             if self._room is None:
                 self._room = jax.tree.map(self._room_for, result)
@@ -79,7 +79,7 @@ class EndToEnd:
         jax.tree.map(place, self._room, result)
 
     def _room_for(self, leaf: Array | np.ndarray) -> np.ndarray:
-        # JAX takes over memory as it is where it begins at a multiple of 64 bytes.
+        # JAX uses memory without a copy if it begins at a multiple of 64 bytes.
         shape = (self._parts * leaf.shape[0], *leaf.shape[1:])
         size = leaf.dtype.itemsize * math.prod(shape)
         held = np.empty(size + 64, np.uint8)
@@ -87,12 +87,12 @@ class EndToEnd:
         return held[begin : begin + size].view(leaf.dtype).reshape(shape)
 
     def whole(self, count: int) -> PyTree:
-        """The first `count` rows of every leaf: what filled up the last part is left out."""
+        """The first `count` rows of every leaf, without the padding of the last part."""
         return jax.device_put(jax.tree.map(lambda room: room[:count], self._room))
 
 
 def everywhere(tree: PyTree, mesh: Mesh) -> PyTree:
-    """The same tree with its arrays on every device of a mesh, also those of other processes.
+    """The same tree with its arrays on every device of a mesh, including other processes'.
 
     Every process must hold the same values.
     """
@@ -110,13 +110,13 @@ def everywhere(tree: PyTree, mesh: Mesh) -> PyTree:
 def shared_out(fun: Callable[..., Result], mesh: Mesh, same: PyTree, each: PyTree) -> Result:
     """`fun(same, each)` with the leading axis of `each` split over a mesh; called inside a jit.
 
-    What does not divide evenly is filled up with copies of the last entry, and their results
-    dropped. The result is on every device, so what follows does not depend on the mesh.
+    If `count` does not divide evenly, copies of the last entry fill it up, and their results are
+    dropped. The result is on every device, so later computations do not depend on the mesh.
 
     **Arguments:**
 
     - `fun`: gives arrays with the same leading axis.
-    - `same`: what every device needs.
+    - `same`: data that every device needs.
     - `each`: a pytree with `(count,)` before the axes of each leaf.
     """
     count = jax.tree.leaves(each)[0].shape[0]

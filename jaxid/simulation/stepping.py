@@ -1,4 +1,4 @@
-"""How a loop is integrated: solver, steps, interpolation of the reference."""
+"""Settings of a loop's integration: solver, steps, interpolation of the reference."""
 
 import inspect
 from typing import Any, ClassVar, Literal
@@ -16,12 +16,12 @@ from ..errors import ModelError
 class RK4(diffrax.AbstractSolver):
     """The classical Runge–Kutta method of order four, for fixed steps (Kutta 1901).
 
-    diffrax's own methods carry error estimates and dense output, which cost more than the
-    physics of four states when neither is used.
+    diffrax's own methods compute error estimates and dense output. Unused, these still cost more
+    than the physics of four states.
 
     **Arguments:**
 
-    - `rolled`: the stages as a loop, which is less to compile and to hold.
+    - `rolled`: whether the stages are a loop, which compiles faster and needs less memory.
     """
 
     rolled: bool = eqx.field(static=True, default=False)
@@ -33,7 +33,7 @@ class RK4(diffrax.AbstractSolver):
         return 4
 
     def init(self, terms, t0, t1, y0, args) -> None:
-        """It keeps nothing between steps."""
+        """No solver state is kept between steps."""
         return None
 
     def func(self, terms, t0, y0, args):
@@ -70,23 +70,23 @@ class RK4(diffrax.AbstractSolver):
 class Stepping(eqx.Module):
     """Settings of the integration.
 
-    Every diffrax solver of ordinary differential equations as a whole can be used, with fixed steps
-    or with a step-size controller. Steps always end at samples, where the interpolated reference
-    may have a kink or a jump.
+    Every diffrax solver that takes an ordinary differential equation as one term can be used, with
+    fixed steps or with a step-size controller. Steps always end at samples, where the interpolated
+    reference may have a kink or a jump.
 
     **Arguments:**
 
-    - `solver`: a diffrax solver. An implicit one whose root finder has no tolerances of its own
-      takes them from `control`; with fixed steps it gets Newton's method to 1e-9.
+    - `solver`: a diffrax solver. An implicit one whose root finder has no tolerances takes them
+      from `control`; with fixed steps it uses Newton's method with tolerance 1e-9.
     - `substeps`: fixed steps between two samples; None to choose by the loop's fastest time
-      constant. With a controller, the first step is tried this many times shorter than a sample.
+      constant. With a controller, the first step tried is the sample period divided by this number.
     - `control`: an adaptive diffrax step-size controller, in seconds; None for fixed steps, which
       are the fastest.
-    - `adjoint`: how a run is differentiated. Sensitivities are by forward mode: an adjoint for
-      reverse mode alone serves users who differentiate a run themselves.
+    - `adjoint`: how a run is differentiated. Sensitivities use forward mode; an adjoint for reverse
+      mode only is for users who differentiate a run themselves.
     - `interpolation`: of the reference between samples, `"cubic"`, `"linear"` or `"hold"`.
     - `max_steps`: largest number of adaptive steps, for each interval between samples on average.
-    - `settled`: whether jaxid has chosen `substeps`, and may choose more; no setting of a user's.
+    - `settled`: whether jaxid has chosen `substeps`, and may choose more; not set by users.
 
     **Raises:** `ModelError` for a solver or controller that cannot integrate a loop.
     """
@@ -123,7 +123,7 @@ class Stepping(eqx.Module):
 
     @property
     def plain(self) -> bool:
-        """Whether it is jaxid's own method with fixed steps, for which loops are written out."""
+        """Whether it is jaxid's own method with fixed steps, for which loops are unrolled."""
         return isinstance(self.solver, RK4) and self.control is None
 
 
@@ -134,11 +134,11 @@ def _whole(solver: diffrax.AbstractSolver) -> bool:
 
 
 def ready(stepping: Stepping) -> diffrax.AbstractSolver:
-    """The solver with all that diffrax would settle for one that stood alone in a solve.
+    """The solver with the settings that diffrax would give to an unwrapped solver in a solve.
 
     An implicit one whose root finder has no tolerances takes them from the step-size controller.
-    For fixed steps there is none, and diffrax's own root finder is made for one: with tight
-    tolerances it takes rounding for divergence. So Newton's method takes its place.
+    Fixed steps have no controller, and diffrax's own root finder is designed for one: with tight
+    tolerances it mistakes rounding for divergence. Newton's method therefore replaces it.
     """
     solver: Any = stepping.solver
     if isinstance(solver, diffrax.AbstractImplicitSolver):
@@ -151,7 +151,7 @@ def ready(stepping: Stepping) -> diffrax.AbstractSolver:
             at = lambda s: [getattr(s.root_finder, name) for name in names]  # noqa: E731
             solver = eqx.tree_at(at, solver, given)
     if isinstance(solver, diffrax.AbstractRungeKutta) and solver.scan_kind is None:
-        # How its stages are looped over decides which derivatives go through them.
+        # The kind of loop over its stages determines which derivatives are possible.
         kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
         kind = kinds.get(type(stepping.adjoint))
         solver = eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)

@@ -1,4 +1,4 @@
-"""How many steps a loop needs between two samples."""
+"""Number of steps that a loop needs between two samples."""
 
 import dataclasses
 import math
@@ -22,20 +22,20 @@ from .integration import given
 from .loop import ClosedLoop
 from .stepping import RK4
 
-# Steps between two samples above which a simulation is said to be slow, and refused.
+# Steps between two samples above which a simulation is reported as slow, and refused.
 MANY, TOO_MANY = 64, 10_000
 
 
 def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
-    """The loop with the number of steps between samples settled, where the user left it open.
+    """The loop with the number of steps between samples chosen, if the user did not set it.
 
-    A step is at most 2.5 ms, and at most a quarter of the fastest time constant, met with friction
-    at its steepest, at standstill; and no step is so long that a bristle at speed runs away. Time
-    constants do not bind implicit solvers. A number settled before grows where an effect with
-    states of its own, added since, would. A step-size controller needs no number.
+    A step is at most 2.5 ms, and at most a quarter of the fastest time constant, which occurs at
+    standstill, where friction is steepest. It is also short enough for a bristle to be stable at
+    speed. Time constants do not limit implicit solvers. A number chosen before is raised if an
+    effect with its own states was added that needs more. A step-size controller needs no number.
 
-    **Raises:** `ModelError` where more than 10 000 steps would be needed. More than 64 are taken,
-    and said in a `JaxidWarning`.
+    **Raises:** `ModelError` if more than 10 000 steps would be needed. More than 64 are used with
+    a `JaxidWarning`.
     """
     check_joints(loop, recordings[0])
     before, settled = loop.stepping.substeps, loop.stepping.settled
@@ -51,7 +51,7 @@ def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     else:
         still, moving = _rates(loop, recordings)
     if before is None:
-        # The torque of a stiff made-up law is wrong by about (pace · step)⁴ / 20.
+        # The relative error of the torque of a stiff assumed law is about (pace · step)⁴ / 20.
         pace = 7 * loop.controller.pace
         rate = max(1 / 2.5e-3, still / 0.25, moving / 2, pace)
     else:
@@ -60,13 +60,13 @@ def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
 
 
 def steps_at(rate: float, interval: float, name: str) -> int:
-    """How many steps at a rate, 1/s, fill an interval, s.
+    """Number of steps at a rate, 1/s, that fill an interval, s.
 
     **Arguments:**
 
     - `name`: of the loop.
 
-    **Raises:** `ModelError` where they are too many; many are said in a `JaxidWarning`.
+    **Raises:** `ModelError` if there are too many; warns with `JaxidWarning` if there are many.
     """
     steps = max(math.ceil(interval * rate - 1e-9), 1)
     said = (
@@ -85,11 +85,11 @@ def steps_at(rate: float, interval: float, name: str) -> int:
 
 
 def refined(steps: float, name: str) -> int:
-    """A number of steps that the error of fewer asks for; many are said in a `JaxidWarning`.
+    """Number of steps that the error of a coarser run requires; warns if there are many.
 
     **Arguments:**
 
-    - `steps`: wanted between two samples; 10 000 are taken where it is more.
+    - `steps`: wanted between two samples; limited to 10 000.
     - `name`: of the loop.
     """
     taken = math.ceil(min(steps, TOO_MANY))
@@ -111,7 +111,7 @@ def set_substeps(loop: ClosedLoop, substeps: int | None, settled: bool = False) 
 
     **Arguments:**
 
-    - `settled`: whether it is jaxid that has chosen them.
+    - `settled`: whether jaxid has chosen the number.
     """
     stepping = dataclasses.replace(loop.stepping, substeps=substeps, settled=settled)
     return dataclasses.replace(loop, stepping=stepping)
@@ -124,8 +124,8 @@ def _has_states(loop: ClosedLoop) -> bool:
 def with_rolled_stages(loop: ClosedLoop) -> ClosedLoop:
     """The loop with the stages of its steps in a loop: for derivatives, and for many settings.
 
-    Written out, as a lone simulation likes them best, four stages of all tangents are more than
-    the registers and first cache of a core hold: half as fast, and longer to compile.
+    Unrolled stages are fastest for a single simulation. With all tangents, four unrolled stages
+    exceed the registers and first cache of a core: half as fast, and slower to compile.
     """
     solver = loop.stepping.solver
     if not isinstance(solver, RK4):
@@ -136,7 +136,7 @@ def with_rolled_stages(loop: ClosedLoop) -> ClosedLoop:
 
 
 def with_forward_mode(loop: ClosedLoop) -> ClosedLoop:
-    """The loop with an adjoint that knows forward mode, where its own knows reverse mode alone."""
+    """The loop with an adjoint for forward mode, if its own supports reverse mode only."""
     if isinstance(loop.stepping.adjoint, diffrax.ForwardMode | diffrax.DirectAdjoint):
         return loop
     stepping = dataclasses.replace(loop.stepping, adjoint=diffrax.ForwardMode())
@@ -144,11 +144,11 @@ def with_forward_mode(loop: ClosedLoop) -> ClosedLoop:
 
 
 def with_reverse_mode(loop: ClosedLoop, points: int) -> ClosedLoop:
-    """The loop with an adjoint by which its sensitivities can be differentiated backwards.
+    """The loop with an adjoint that allows reverse-mode derivatives of its sensitivities.
 
     **Arguments:**
 
-    - `points`: of the grid; as many states are kept, so that none is computed twice.
+    - `points`: of the grid; this many states are kept, so that none is computed twice.
     """
     if loop.stepping.plain:
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=points)
@@ -164,7 +164,7 @@ def fastest_rate(loop: ClosedLoop, recordings: Recordings) -> float:
 
 
 def _rates(loop: ClosedLoop, recordings: Recordings) -> tuple[float, float]:
-    """Largest eigenvalues at standstill, and as fast as recordings get over ten samples, 1/s."""
+    """Largest eigenvalues at standstill, and at the highest speed over ten samples, 1/s."""
     few = [np.arange(0, r.samples, max(1, r.samples // 8)) for r in recordings]
     still = np.concatenate([r.q[rows] for r, rows in zip(recordings, few, strict=True)])
     names, q, v = held_names(recordings), [], []

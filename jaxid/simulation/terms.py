@@ -1,4 +1,4 @@
-"""What a drive is in the terms of a physics simulator: MuJoCo's, and of those that follow it."""
+"""Drives in the parameters of a physics simulator: MuJoCo and those with the same parameters."""
 
 import math
 
@@ -29,16 +29,16 @@ from .loop import ClosedLoop
 
 SAID = (Viscous, Coulomb, RotorInertia, DCMotor, DriveGain, TimeDelay, TorqueSaturation)
 LAWS = (PD, PID, Servo, Impedance)
-# An error at which every drive that has a limit is at it, rad or m.
+# An error large enough for every drive that has a limit to reach it, rad or m.
 _FAR = 1e6
 
 
 class JointTerms(eqx.Module):
-    """One joint's drive as a simulator takes it, in SI units on the joint's side of the gear.
+    """One joint's drive in a simulator's parameters, in SI units on the joint's side of the gear.
 
-    The actuator's torque is kp (q_ref - q) - kd v within ±`forcerange`, late by `delay`; the joint
-    has `armature`, `damping`, which holds the braking of a motor by its back-EMF, and
-    `frictionloss`. `kp` and `kd` are None for a law that is none of these.
+    The actuator's torque is kp (q_ref - q) - kd v within ±`forcerange`, delayed by `delay`. The
+    joint has `armature`, `damping`, which includes the braking of a motor by its back-EMF, and
+    `frictionloss`. `kp` and `kd` are None for a law of another form.
     """
 
     armature: float
@@ -53,11 +53,11 @@ class JointTerms(eqx.Module):
 def joint_terms(
     loop: ClosedLoop, told: dict[str, Float[np.ndarray, " joints"]] | None = None
 ) -> tuple[JointTerms, ...]:
-    """The drives of a loop in a simulator's terms, as far as these go; one for each joint.
+    """The drives of a loop in a simulator's parameters, as far as possible; one for each joint.
 
     **Arguments:**
 
-    - `told`: what a recording says of its drives (`kp`, `kd`, `supply`), by name, `(joints,)`.
+    - `told`: properties of the drives in a recording (`kp`, `kd`, `supply`), by name, `(joints,)`.
     """
     law, late = loop.controller, np.zeros(loop.joints)
     limit = np.full(loop.joints, np.inf)
@@ -87,9 +87,9 @@ def joint_terms(
 
 
 def unsaid(loop: ClosedLoop) -> dict[int, str]:
-    """What of a loop these terms do not express: by the effect's place in it, and -1 for the rest.
+    """Parts of a loop that these parameters do not express, by the effect's index, -1 for others.
 
-    Each with the reason, a sentence's part. The rest is what no effect that could be left out is:
+    Each has its reason, as part of a sentence. The others are not effects that could be left out:
     parts of the law, and a motor's limit of current.
     """
     found: dict[int, str] = {}
@@ -126,7 +126,7 @@ def _delivered(
     command: Float[Array, " joints"],
     v: Float[Array, " joints"],
 ) -> Float[Array, " joints"]:
-    """What drives that can be said make of a command at a speed, `(joints,)`."""
+    """Torque that the drives that can be expressed make of a command at a speed, `(joints,)`."""
     still = jnp.zeros_like(v)
     for effect in loop.effects:
         if isinstance(effect, DCMotor | DriveGain | TorqueSaturation):
@@ -137,7 +137,7 @@ def _delivered(
 
 
 def _delivered_slopes(loop: ClosedLoop) -> Float[np.ndarray, "joints joints"]:
-    """How the torque of the drives falls with speed while nothing is commanded."""
+    """Decrease of the drives' torque with speed at zero command."""
     still = jnp.zeros(loop.joints)
     return np.asarray(jax.jacfwd(lambda v: _delivered(loop, still, v))(still))
 
@@ -160,7 +160,7 @@ def _gains(
         command = jnp.clip(law.command(reading, reference, state, mass), -limit, limit)
         return _delivered(loop, command, still)
 
-    # A little beyond a deadband, within which nothing has a slope.
+    # Slightly beyond the deadband, inside which all slopes are zero.
     near = still + 1e-9 + (law.deadband if isinstance(law, Servo) else 0.0)
     by_error, by_speed = jax.jacfwd(torque, argnums=(0, 1))(near, still)
     most = np.asarray(torque(still + _FAR, still))

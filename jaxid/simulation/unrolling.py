@@ -1,9 +1,9 @@
-"""Small array programs written out as programs of scalars, which compilers do far better with.
+"""Unrolls small array programs into programs of scalars, which compilers optimise far better.
 
-The physics of a few joints is a hundred sums and products. Written with arrays of two, most of
-its time and of its compilation goes into moving pairs of numbers; written out, a batch of
-recordings or of tangents becomes the one array axis that is left, and one instruction of a
-processor handles eight of them.
+The physics of a few joints is a hundred sums and products. With arrays of two elements, most of
+the run time and compilation is spent on moving pairs of numbers. In unrolled form, a batch of
+recordings or of tangents is the only array axis left, and one instruction of a processor handles
+eight of its elements.
 """
 
 import math
@@ -21,8 +21,8 @@ from .decompositions import decomposed
 from .kernels import plain_product, say_what_splits, summed_product
 from .moves import MOVES
 
-# Arrays above these sizes are left whole: writing a spline's dozen knots out would only make
-# programs long. Matrices and what has more axes are a few joints' own, and their derivatives.
+# Arrays above these sizes are not unrolled: unrolling a spline's dozen knots would only make
+# programs long. Arrays with two or more axes belong to a few joints and their derivatives.
 WHOLE, WHOLE_MATRIX = 9, 36
 
 ELEMENTWISE = frozenset(
@@ -39,23 +39,23 @@ INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_c
 def unrolled(fun: Callable[..., Any], *like: Any) -> Callable[..., Any]:
     """The same function, traced once and evaluated scalar by scalar.
 
-    Operations that it does not know how to write out (loops, eigenvalues, functions with a
-    derivative of their own) and large arrays are evaluated as they are; a warning names what of
-    them XLA cannot compile as a part of a loop's kernel.
+    Operations that cannot be unrolled (loops, eigenvalues, functions with a custom derivative) and
+    large arrays are evaluated as they are; a warning names those that XLA cannot compile as part
+    of a loop's kernel.
 
-    Values are those of `fun` under `jax.jit`, signed zeros, infinities and NaN among them, up to
-    rounding (sums may be added in another order) and the sign of sums of zeros alone.
+    Values equal those of `fun` under `jax.jit`, including signed zeros, infinities and NaN, up to
+    rounding (sums may be added in another order) and the sign of sums that contain only zeros.
 
     **Arguments:**
 
     - `fun`: a function of pytrees of arrays.
-    - `like`: arguments of the shapes that it will be called with.
+    - `like`: arguments with the shapes of later calls.
     """
     closed, shape = jax.make_jaxpr(fun, return_shape=True)(*like)
     structure = jax.tree.structure(shape)
     consts = [_Value.of(c) for c in closed.consts]
     for const in consts:
-        # Here, not where they are first needed, which may be inside a loop.
+        # Done here, since the first use may be inside a loop.
         const.scalars() if const.small else const.whole()
 
     def evaluate(*args: Any) -> Any:
@@ -63,13 +63,13 @@ def unrolled(fun: Callable[..., Any], *like: Any) -> Callable[..., Any]:
         outputs = _Writer().run(closed.jaxpr, consts, inputs)
         return jax.tree.unflatten(structure, [value.whole() for value in outputs])
 
-    # As a part of its own: the stages of a step share one trace of it, batched and differentiated
-    # once. XLA inlines them.
+    # A separate jitted function: the stages of a step share one trace of it, which is batched and
+    # differentiated once. XLA inlines the calls.
     return jax.jit(evaluate)
 
 
 class _Value:
-    """An array as one tracer, as an object array of scalars, or as both once both were needed."""
+    """An array as one tracer, as an object array of scalars, or both if both were needed."""
 
     def __init__(self, shape, dtype, array=None, scalars=None):
         self.shape, self.dtype = tuple(shape), dtype
@@ -118,9 +118,9 @@ def _known(x) -> bool:
 
 
 def _same(name: str, args: list[Any]):
-    """The operand that an operation leaves as it is; None where it changes it.
+    """The operand that an operation returns unchanged; None if it changes its operands.
 
-    −0 + 0 is 0 by IEEE 754, but XLA too leaves out the addition of a known zero of either sign.
+    −0 + 0 is 0 by IEEE 754, but XLA also omits the addition of a known zero of either sign.
     """
     if len(args) != 2:
         return None
@@ -132,7 +132,7 @@ def _same(name: str, args: list[Any]):
 
 
 def _as_it_is(eqn, inputs: list[_Value], origin) -> list[_Value]:
-    """One equation evaluated with whole arrays; it comes from the outermost one, `origin`."""
+    """One equation, part of the outermost one `origin`, evaluated with whole arrays."""
     whole = [v.whole() for v in inputs]
     out = summed_product(eqn, whole) or decomposed(eqn, whole)
     if out is None:
@@ -143,9 +143,9 @@ def _as_it_is(eqn, inputs: list[_Value], origin) -> list[_Value]:
 
 
 def _bound(eqn, whole: list[Any], origin) -> Sequence[Any]:
-    """What the primitive itself makes of arrays."""
+    """The result of the primitive itself on whole arrays."""
     given = eqn.primitive.get_bind_params(eqn.params)
-    # Before jax 0.10 functions among the parameters came apart from the rest.
+    # Before jax 0.10, functions among the parameters were returned separately.
     functions, params = given if isinstance(given, tuple) else ((), given)
     if eqn.primitive.name == "custom_linear_solve":
         params = _with_solver_written_out(params, origin)
@@ -154,9 +154,9 @@ def _bound(eqn, whole: list[Any], origin) -> Sequence[Any]:
 
 
 def _with_solver_written_out(params: dict[str, Any], origin) -> dict[str, Any]:
-    """The parameters of a linear solve, its derivative still that of a solve.
+    """The parameters of a linear solve with unrolled functions; its derivative is still a solve.
 
-    Only reverse mode needs the transposed ones.
+    Only reverse mode needs the transposed functions.
     """
 
     def written(closed: ClosedJaxpr) -> ClosedJaxpr:
@@ -177,9 +177,9 @@ class _Writer:
 
     def __init__(self, origin=None):
         self.seen: dict[Any, Any] = {}
-        # Keys hold identities, so what they name must live as long as they do.
+        # Keys contain `id`s, so the objects that these refer to must be kept alive.
         self.alive: list[Any] = []
-        # The equation that is being evaluated, the outermost if one is a part of another.
+        # The equation that is being evaluated; the outermost one if equations are nested.
         self.origin = origin
 
     def run(self, jaxpr: Jaxpr, consts: list[_Value], args: list[_Value]) -> list[_Value]:
@@ -217,14 +217,14 @@ class _Writer:
         return _as_it_is(eqn, inputs, self.origin or eqn)
 
     def inlined(self, eqn, inner: ClosedJaxpr, inputs: list[_Value]) -> list[_Value]:
-        """A function that was traced as a part, in the place of its call."""
+        """A separately traced function, inlined at its call."""
         before, self.origin = self.origin, self.origin or eqn
         found = self.run(inner.jaxpr, [_Value.of(c) for c in inner.consts], inputs)
         self.origin = before
         return found
 
     def written(self, eqn, name: str, inputs: list[_Value]):
-        """The scalars of what an equation gives; None where it cannot be written out."""
+        """The scalars of an equation's result; None if it cannot be unrolled."""
         p = eqn.params
         if name in ELEMENTWISE:
             return self.elementwise(eqn, [v.scalars() for v in inputs])
@@ -256,12 +256,12 @@ class _Writer:
         return self.once(primitive.name, params, args, partial(primitive.bind, **params))
 
     def once(self, name: str, params, args: list[Any], evaluate: Callable[..., Any]):
-        """One scalar operation, or what it gave before."""
+        """One scalar operation, or its earlier result."""
         if all(_known(a) for a in args):
             if name in ARITHMETIC:
                 with np.errstate(all="ignore"):
                     return ARITHMETIC[name](*args)
-            # What becomes of numbers that an integer type lacks is XLA's to say.
+            # XLA decides how numbers outside an integer type's range are converted.
             if name == "convert_element_type" and not (
                 args[0].dtype.kind == "f" and np.dtype(params["new_dtype"]).kind in "iu"
             ):
@@ -272,7 +272,7 @@ class _Writer:
         key = (
             name,
             tuple(sorted((k, str(v)) for k, v in params.items() if v is not None)),
-            # By their bits: −0 and 0 are equal, and divide differently.
+            # Compared by their bits: −0 and 0 are equal, but dividing by them differs.
             tuple((a.dtype, a.tobytes()) if _known(a) else id(a) for a in args),
         )
         if key not in self.seen:
@@ -287,7 +287,7 @@ class _Writer:
         return self.once("add", {}, [a, b], jax.lax.add)
 
     def added(self, terms: list[Any], dtype):
-        """The sum of zero and some terms, from the first to the last."""
+        """The sum of zero and the terms, added from first to last."""
         return reduce(self.plus, terms, np.zeros((), dtype)[()])
 
     def converted(self, value: _Value, dtype) -> np.ndarray:
@@ -359,7 +359,7 @@ class _Writer:
         return out
 
 
-# What is worth knowing already when a program is written: indices, and zeros.
+# Values worth evaluating when a program is traced: indices and zeros.
 ARITHMETIC: dict[str, Callable[..., Any]] = {
     "add": lambda a, b: a + b,
     "sub": lambda a, b: a - b,
