@@ -69,7 +69,7 @@ app.command()(demo)
 def main() -> None:
     """Entry point of the `jaxid` command."""
     leave_on_interrupt()
-    # Where there is no home or it cannot be written, each run compiles for itself.
+    # Without a writable home folder, compiled programs are not kept.
     with contextlib.suppress(OSError, RuntimeError):
         from ..compiling import keep_programs
 

@@ -1,4 +1,4 @@
-"""What the columns of a log may mean, and the TOML file that says what they do."""
+"""Guesses the signals in the columns of a log, and writes the TOML file that describes them."""
 
 import itertools
 import json
@@ -8,8 +8,8 @@ from typing import Any
 
 from ..recording import Contents
 
-# What logs call the signals, numbers and folders aside; the first that is there is meant. A name
-# may go on after it, as pos_measured.
+# Common names of the signals, without numbers and folders; the first that occurs is taken. A
+# column may continue after the name, as pos_measured.
 _CALLED = {
     "time": ("time", "t", "stamp", "timestamp", "time_s", "sec", "ms", "dt", "period"),
     "q": ("q", "pos", "position", "angle", "theta", "joint_pos", "qpos", "actual_q"),
@@ -18,14 +18,14 @@ _CALLED = {
     "q_ref": ("q_ref", "qref", "qr", "ref", "des", "q_des", "target", "target_q", "goal", "cmd"),
 }
 _MORE = {"q_ref": ("q_goal", "q_cmd", "action"), "tau": ("pwm", "duty", "voltage", "volts")}
-# What is proportional to torque at best.
+# Signals that are at best proportional to torque.
 _CURRENTS = ("i", "cur", "current", "actual_current", "amps")
 _VOLTAGES = ("pwm", "duty", "voltage", "volts")
 _UNITS = {"time": ("ms", "us"), "q": ("deg", "mm", "mrad"), "q_ref": ("deg", "mm", "mrad")}
 
 
 def guess(names: Sequence[str]) -> dict[str, Any]:
-    """Which columns a log's names may mean; empty where a signal that is needed is not found."""
+    """Probable columns of the signals by name; empty if a required signal is not found."""
     stems: dict[str, list[tuple[int, str]]] = {}
     for name in names:
         stem, number = _parts(name)
@@ -43,16 +43,16 @@ def guess(names: Sequence[str]) -> dict[str, Any]:
 
 
 def _parts(name: str) -> tuple[str, int]:
-    """A column's name without its folder and number, and that number."""
+    """The name of a column without folder and number, and the number."""
     match = re.fullmatch(r"(.*?)[_.\[ ]*(\d*)\]?", name.strip().lower().rpartition("/")[2])
     assert match is not None
     return match[1], int(match[2] or 0)
 
 
 def _word(signal: str, words: Sequence[str], stems: Mapping[str, Any]) -> str | None:
-    """The stem that is one of the words, or else begins with one of more than two letters."""
+    """A stem that is one of the words, or one that begins with a word of three letters or more."""
     exact = next((word for word in words if word in stems), None)
-    # Nothing is a time only because its name begins like one.
+    # A name is not taken for time only because it begins with a word for time.
     longer = () if signal == "time" else (f"{word}_" for word in words if len(word) > 2)
     begun = (stem for word in longer for stem in stems if stem.startswith(word))
     if signal == "time" and exact is None:
@@ -61,7 +61,7 @@ def _word(signal: str, words: Sequence[str], stems: Mapping[str, Any]) -> str | 
 
 
 def guess_units(columns: Mapping[str, Any], given: Sequence[str]) -> dict[str, str]:
-    """Units that names of columns end with, of signals for which none is given as `q=deg`."""
+    """Units at the ends of column names, for signals without a given unit such as `q=deg`."""
     told = {item.partition("=")[0].strip() for item in given}
     found = {}
     for signal, names in columns.items():
@@ -73,11 +73,11 @@ def guess_units(columns: Mapping[str, Any], given: Sequence[str]) -> dict[str, s
 
 
 def on_torque(names: Sequence[str]) -> str:
-    """What to say where columns taken for torque are called otherwise; nothing where they are not.
+    """A remark if the names of the torque columns suggest another quantity; otherwise empty.
 
     **Arguments:**
 
-    - `names`: the columns of `tau`; a product has been given its factor.
+    - `names`: the columns of `tau`; a product already contains its factor.
     """
     stems = {_parts(name)[0] for name in names if "*" not in name}
     if stems & {*_CURRENTS}:
@@ -94,13 +94,13 @@ def on_torque(names: Sequence[str]) -> str:
 
 
 def description(told: Mapping[str, Any], found: Contents, joints: int) -> str:
-    """A TOML file that says how files are read, with what else may be said in it.
+    """A TOML file that describes how files are read, with further options as comments.
 
     **Arguments:**
 
-    - `told`: what was said when they were read, by the names of `jaxid.read`.
-    - `found`: what the first of them holds.
-    - `joints`: how many there are.
+    - `told`: the options with which they were read, by the names of `jaxid.read`.
+    - `found`: the contents of the first file.
+    - `joints`: number of joints.
     """
     units = {"time": "s", "q": ["rad"] * joints, "tau": ["Nm"] * joints} | told.get("units", {})
     scale = {"q": [1.0] * joints, "tau": [1.0] * joints} | told.get("scale", {})
@@ -141,7 +141,7 @@ def _columns(found: Contents) -> dict[str, Any]:
 
 
 def taken(found: Contents) -> str:
-    """Which columns are which signal, where they are named by joint."""
+    """The columns of each signal, if they are named by joint."""
     parts = []
     for signal, names in found.signals.items():
         stem = _common(names) if len(names) > 1 else ""
@@ -152,6 +152,6 @@ def taken(found: Contents) -> str:
 
 
 def _common(names: Sequence[str]) -> str:
-    """What all names begin with."""
+    """The common prefix of all names."""
     same = itertools.takewhile(lambda column: len(set(column)) == 1, zip(*names, strict=False))
     return "".join(letters[0] for letters in same)

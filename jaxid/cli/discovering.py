@@ -36,12 +36,12 @@ from .showing import LEGEND, error_falls, say, tell
 class Spread(TyperCommand):
     """A command in which `--validate` takes every file up to the next option.
 
-    Only after the files to fit: in `--validate a.csv b.csv` with none before, the second is one
-    of those.
+    This holds only after the files to fit: in `--validate a.csv b.csv` with no file before, the
+    second file is one to fit.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Writes `--validate` before each of its files, which is how one option takes several."""
+        """Inserts `--validate` before each of its files, so that the option takes several."""
         valued = {name for p in self.params for name in p.opts if not getattr(p, "is_flag", True)}
         return super().parse_args(ctx, spread(args, "--validate", valued))
 
@@ -51,7 +51,7 @@ def spread(args: list[str], option: str, valued: set[str]) -> list[str]:
 
     **Arguments:**
 
-    - `option`: the one that may take several.
+    - `option`: the option that may take several values.
     - `valued`: options that take one value.
     """
     out: list[str] = []
@@ -125,7 +125,7 @@ def discover(
     from ..report import write_report
 
     journal = _Kept(resume)
-    # The folder outlives the interrupt, whose farewell takes the steps out of it.
+    # The folder must exist until the farewell of an interrupt has moved the steps out of it.
     with journal, sentences(journal.farewell):
         check_outputs(json_file, report, save)
         loop = with_controller(load_robot(robot), controller)
@@ -155,7 +155,7 @@ def discover(
 
 
 class _Kept:
-    """Where the steps of a discovery are saved: the user's folder, or one an interrupt keeps."""
+    """Folder for the steps of a discovery: the user's, or a temporary one kept on interrupt."""
 
     def __init__(self, resume: Path | None) -> None:
         self.own = Path(tempfile.mkdtemp(prefix="jaxid-")) if resume is None else None
@@ -166,11 +166,11 @@ class _Kept:
 
     def __exit__(self, *_: object) -> None:
         if self.own is not None:
-            # What an interrupt wants kept has been moved out of here by its farewell.
+            # After an interrupt, the farewell has already moved the steps out of this folder.
             shutil.rmtree(self.own, ignore_errors=True)
 
     def farewell(self) -> str:
-        """What is said after an interrupt: what was done, and how to go on from there."""
+        """The message after an interrupt: what was done, and how to continue."""
         done = len(list(self.path.glob("*.piece")))
         if not done:
             return " before the first step was done; nothing is saved"
@@ -183,7 +183,7 @@ class _Kept:
 
 
 def _names(name: str) -> Iterator[Path]:
-    """The name, then the same with a number."""
+    """The name, then the same name with increasing numbers."""
     path = Path(name)
     yield path
     for k in itertools.count(2):

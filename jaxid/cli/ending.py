@@ -1,4 +1,4 @@
-"""How a command ends: on a user's mistake with one sentence, on Ctrl-C at once."""
+"""Ends of commands: one sentence after a user's mistake, an immediate exit on Ctrl-C."""
 
 import contextlib
 import os
@@ -15,18 +15,18 @@ import typer
 
 from ..errors import JaxidError, JaxidWarning
 
-# What shells give for a command that Ctrl-C ended.
+# Exit code that shells use for a command ended by Ctrl-C.
 INTERRUPTED = 130
 UNDETERMINED = 3
 
 
 @contextlib.contextmanager
 def sentences(on_interrupt: Callable[[], str] = str) -> Iterator[None]:
-    """Ends on a user's error with its one sentence and on Ctrl-C with a message, no traceback.
+    """Ends with one sentence on a user's error and a message on Ctrl-C, without a traceback.
 
     **Arguments:**
 
-    - `on_interrupt`: saves what is to be saved then, and gives what else to say.
+    - `on_interrupt`: saves results after an interrupt and returns the rest of the message.
     """
     _farewell[0] = on_interrupt
     with warnings.catch_warnings():
@@ -42,18 +42,18 @@ def sentences(on_interrupt: Callable[[], str] = str) -> Iterator[None]:
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *where: Any) -> None:
-    # The line of jaxid's source that warned says nothing to someone at a prompt.
+    # The source line of a warning does not help users of the command line.
     said = str(message) if issubclass(category, JaxidWarning) else f"{category.__name__}: {message}"
     typer.echo(f"jaxid: {said}", err=True)
 
 
-# What an interrupt does and says beside that it was one; a command in progress sets it.
+# Further action and message on an interrupt; set by the running command.
 _farewell: list[Callable[[], str] | None] = [str]
 _parting = threading.Lock()
 
 
 def _part() -> None:
-    """Says that it was an interrupt, once, whichever thread comes first; the other waits for it."""
+    """Reports the interrupt once, from the first thread that calls; the other thread waits."""
     with _parting:
         farewell, _farewell[0] = _farewell[0], None
         if farewell is not None:
@@ -61,10 +61,10 @@ def _part() -> None:
 
 
 def leave_on_interrupt() -> None:
-    """Ends the process a second after Ctrl-C if the main thread has not: it may be compiling.
+    """Ends the process a second after Ctrl-C if the main thread has not, as while compiling.
 
     Python's own handler waits for the compiler to return, which takes up to a minute. Files are
-    written under another name first, so that none is left half done.
+    written under another name first, so that no incomplete file remains.
     """
     ours, theirs = socket.socketpair()
     theirs.setblocking(False)
@@ -82,8 +82,8 @@ def leave_on_interrupt() -> None:
 
 
 def leave() -> None:
-    # A compilation may be on its way in a thread of XLA's; taking the interpreter down under it
-    # makes it abort.
+    # A compilation may be running in an XLA thread; it aborts if the interpreter shuts down
+    # normally.
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(INTERRUPTED)

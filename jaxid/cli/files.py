@@ -13,7 +13,7 @@ from ..errors import ModelError, near
 
 
 class ReadOptions(eqx.Module):
-    """How files are read: the options that say what is in them."""
+    """Options that describe the contents of files and how they are read."""
 
     column: list[str] | None = None
     unit: list[str] | None = None
@@ -23,7 +23,7 @@ class ReadOptions(eqx.Module):
     drop_nan: bool = False
 
     def told(self) -> dict[str, Any]:
-        """What `jaxid.read` takes beside files: the description, and what options add to it.
+        """Arguments of `jaxid.read` other than files, from the description and the options.
 
         **Raises:** `ModelError` for a description or an option that cannot be understood.
         """
@@ -49,9 +49,9 @@ class ReadOptions(eqx.Module):
 
 
 def described(path: Path) -> dict[str, Any]:
-    """What a TOML file says of logs, by the names that `jaxid.read` gives it.
+    """The description of logs in a TOML file, by the argument names of `jaxid.read`.
 
-    **Raises:** `ModelError` for a file that says something else.
+    **Raises:** `ModelError` for a file with other contents.
     """
     known: dict[str, Any] = {"columns": dict, "units": dict, "scale": dict, "joints": list}
     known |= {"resolution": (int, float, list), "gaps": str, "nan": str, "clock": str}
@@ -72,7 +72,7 @@ def described(path: Path) -> dict[str, Any]:
 
 
 def _several(named: dict[str, str] | None) -> dict[str, Any]:
-    """Values that name one thing for each joint, taken apart."""
+    """The values, with comma-separated ones split into one item per joint."""
     return {
         name: value.split(",") if "," in value else value for name, value in (named or {}).items()
     }
@@ -98,7 +98,7 @@ def write_json(path: Path | None, content: dict[str, Any]) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """The same with null for what JSON has no number for."""
+    """The same value with null for numbers that JSON cannot represent."""
     if isinstance(value, dict):
         return {key: _plain(inner) for key, inner in value.items()}
     if isinstance(value, list):
@@ -107,7 +107,7 @@ def _plain(value: Any) -> Any:
 
 
 def check_outputs(*paths: Path | None) -> None:
-    """Says before the work, not after it, that a result would have nowhere to go."""
+    """Checks before the computation that results can be written."""
     for path in paths:
         if path is not None and not path.resolve().parent.is_dir():
             raise ModelError(f"there is no folder {path.parent} for {path.name}: make it first")

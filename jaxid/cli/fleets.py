@@ -11,7 +11,7 @@ from .files import ReadOptions, check_outputs, write_json
 from .models import load_robot, with_controller
 from .options import Controller, Json, Quiet
 
-# Columns of the table; the first three are needed.
+# Columns of the table; the first three are required.
 _COLUMNS = ("name", "robot", "fit", "validate", "log")
 
 
@@ -67,7 +67,7 @@ def discover_all(
 
 
 def _problems(table: Path, controller: str | None) -> tuple[dict[str, Any], dict[str, str]]:
-    """The robots of a table that can be read, and why the others cannot."""
+    """The robots of a table that can be read, and the reasons why others cannot."""
     import pandas as pd
 
     from ..discovery import FleetRobot

@@ -94,12 +94,12 @@ def inspect(
 
 
 def _named(reading: ReadOptions) -> dict[str, Any]:
-    """What the options say of columns and joints."""
+    """The options for columns and joints."""
     return {key: value for key, value in reading.told().items() if key in ("columns", "joints")}
 
 
 def _pairs(named: Mapping[str, Any]) -> list[str]:
-    """As options on the command line."""
+    """The values in the form of command-line options."""
     return [f"{k}={v if isinstance(v, str) else ','.join(v)}" for k, v in named.items()]
 
 

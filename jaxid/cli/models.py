@@ -1,4 +1,4 @@
-"""Models that a command is given by name, by file, or as what another command wrote."""
+"""Models given to a command by name, by file, or as the output of another command."""
 
 import importlib.util
 import json
@@ -11,12 +11,12 @@ from ..errors import ModelError
 
 
 def load_robot(robot: str | None) -> Any:
-    """A loop by the name of a ready robot, or from a Python file.
+    """A loop from the name of a predefined robot or from a Python file.
 
     **Arguments:**
 
     - `robot`: `scara`, `two-link`, `emps`, a URDF file, or `path/to/file.py:name` of a loop, or of
-      a function without arguments that gives one; None where the user named none.
+      a function without arguments that returns one; None if the user named none.
 
     **Raises:** `ModelError` that says what was not found.
     """
@@ -53,7 +53,7 @@ def load_robot(robot: str | None) -> Any:
 
 
 def load_effect(given: str) -> Any:
-    """An effect's class from a Python file, or whatever else a catalogue may hold.
+    """An effect class, or any other entry of a catalogue, from a Python file.
 
     **Arguments:**
 
@@ -76,7 +76,7 @@ def _module(path: str) -> Any:
         raise ModelError(f"there is no file {path}: give the path of your own Python file")
     known, stamp = sys.modules.get(Path(path).stem), Path(path).stat().st_mtime_ns
     mine = known is not None and getattr(known, "__file__", None) == path
-    # One class for whoever names the file again, unless it was written anew in between.
+    # A file that is named again gives the same classes, unless it has changed in between.
     if mine and getattr(known, "_read_at", None) == stamp:
         return known
     spec = importlib.util.spec_from_file_location(Path(path).stem, path)
@@ -85,7 +85,7 @@ def _module(path: str) -> Any:
     module = importlib.util.module_from_spec(spec)
     sys.path.insert(0, str(Path(path).resolve().parent))
     module._read_at = stamp  # type: ignore[attr-defined]
-    # Annotations that are strings are looked up in the module that they were written in.
+    # Annotations given as strings are resolved in the module that defines them.
     if known is None or mine:
         sys.modules[spec.name] = module
     try:
@@ -96,7 +96,7 @@ def _module(path: str) -> Any:
 
 
 def with_controller(loop: Any, controller: str | None) -> Any:
-    """The loop under the law that `--controller` names; its own where it names none."""
+    """The loop with the control law of `--controller`; its own law if none is named."""
     import dataclasses
 
     from ..control import OpenLoop, Tracking
@@ -110,13 +110,13 @@ def with_controller(loop: Any, controller: str | None) -> Any:
 
 
 def saved_model(robot: str | None, path: Path | None, own: frozenset[type] = frozenset()) -> Any:
-    """The robot, at the values, or instead of it the model, that an earlier command wrote.
+    """The robot with values written by an earlier command, or the model that it wrote.
 
     **Arguments:**
 
-    - `robot`: as for `load_robot`; a saved model needs none, unless its classes are the robot's.
-    - `path`: what was written; None for the robot as it is.
-    - `own`: further classes of the user's.
+    - `robot`: as for `load_robot`; a saved model needs it only if it uses the robot's classes.
+    - `path`: the written file; None for the unchanged robot.
+    - `own`: further classes of the user.
     """
     if path is None:
         return load_robot(robot)
@@ -142,9 +142,9 @@ def saved_model(robot: str | None, path: Path | None, own: frozenset[type] = fro
 
 
 def without(catalogue: Sequence[Any], names: Sequence[str]) -> list[Any]:
-    """The catalogue less some effects by name.
+    """The catalogue without the effects of the given names.
 
-    **Raises:** `ModelError` for a name that it does not have.
+    **Raises:** `ModelError` for a name that is not in the catalogue.
     """
     known = {entry.effect_name() for entry in catalogue}
     unknown = sorted(set(names) - known)

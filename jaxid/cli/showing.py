@@ -1,4 +1,4 @@
-"""What commands print beside a result's own text."""
+"""Output of commands in addition to the text of a result."""
 
 import os
 import sys
@@ -9,7 +9,7 @@ import typer
 
 
 def say(text: str, **style: Any) -> None:
-    """Prints a line, in colour where the terminal has it and the user wants it."""
+    """Prints a line, in colour if the terminal supports it and the user wants it."""
     plain = "NO_COLOR" in os.environ or not sys.stdout.isatty()
     typer.echo(text if plain else typer.style(text, **style))
 
@@ -20,7 +20,7 @@ def pooled(result: Any) -> dict[str, float]:
 
 
 def tell(story: Any, quiet: bool = False) -> None:
-    """Prints a discovery: its verdict, and all of it where that is wanted."""
+    """Prints a discovery: its verdict, and all of it unless `quiet`."""
     verdict, _, rest = repr(story).partition("\n")
     colour = "green" if story.verdict in ("adequate", "explained") else "yellow"
     if quiet:
@@ -38,7 +38,7 @@ noise floor:    the error that a perfect model would leave
 
 
 def error_falls(story: Any) -> None:
-    """A bar a step: held-out error of the joint at which the starting model did worst."""
+    """Prints one bar per step: held-out error of the joint that the starting model fits worst."""
     table = story.table()
     if len(table) < 2:
         return

@@ -1,4 +1,4 @@
-"""What works and how long it still takes: lines on a terminal, a line in a notebook."""
+"""Progress with the time left: lines on a terminal, one line in a notebook."""
 
 import contextlib
 import html
@@ -9,17 +9,17 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-# Updates of a notebook's line in a second, and of a terminal's.
+# Updates per second, in a notebook and on a terminal.
 _RATE = 4
 _BAR = 16
 
 
 class Line:
-    """The state of something that works: what it does, since when, and how long it still takes.
+    """The state of a running task: the current activity, the time elapsed and the time left.
 
     **Arguments:**
 
-    - `title`: of all of it.
+    - `title`: title of the task.
     """
 
     def __init__(self, title: str) -> None:
@@ -29,9 +29,9 @@ class Line:
         self._ends: float | None = None
 
     def say(self, text: str, share: float | None = None, left: float | None = None) -> None:
-        """Takes what is being done, the share that is done, 0 to 1, and the time left, s.
+        """Sets the current activity, the share that is done, 0 to 1, and the time left, s.
 
-        The time left is counted down until another is given; of a known share it follows.
+        The time left counts down until it is set again; if the share is given, it follows from it.
         """
         self.text, self.share, now = text, share, time.perf_counter()
         if share:
@@ -40,7 +40,7 @@ class Line:
             self._ends = now + left
 
     def head(self) -> str:
-        """How long it has been, and how long it still takes where that is known."""
+        """The time elapsed, the title, and the time left if it is known."""
         now = time.perf_counter()
         said = f"{clock(now - self.began)}  {self.title}"
         if self._ends is not None and self._ends > now:
@@ -48,7 +48,7 @@ class Line:
         return said
 
     def lines(self, width: int) -> list[str]:
-        """All of it in lines of a width; what is long is wrapped and never cut."""
+        """The whole text in lines of a given width; long text is wrapped, not truncated."""
         head = textwrap.wrap(self.head(), width)
         if self.share is not None and len(head[-1]) + _BAR + 2 <= width:
             done = round(_BAR * min(max(self.share, 0.0), 1.0))
@@ -59,16 +59,16 @@ class Line:
     def __rich_console__(self, console: Any, options: Any) -> Iterator[Any]:
         from rich.text import Text
 
-        # One column less: some terminals go to the next line at the last one.
+        # One column less, since some terminals wrap at the last column.
         yield Text("\n".join(self.lines(options.max_width - 1)))
 
 
 class Pace:
-    """How long pieces of work of some kinds take, and from that how long the rest will.
+    """Measures the durations of pieces of work by kind and predicts the time left from them.
 
     **Arguments:**
 
-    - `course`: kinds of the pieces that are expected, in their order.
+    - `course`: kinds of the expected pieces, in order.
     """
 
     def __init__(self, course: Sequence[str], now: Callable[[], float] = time.perf_counter) -> None:
@@ -77,11 +77,11 @@ class Pace:
         self._at: tuple[str, float] | None = None
 
     def begin(self, kind: str, then: Sequence[str] | None = None) -> float | None:
-        """Begins a piece, which ends the last one; the time left in s, None where it is not known.
+        """Begins a piece and ends the last one; returns the time left in s, None if unknown.
 
         **Arguments:**
 
-        - `then`: what is expected after it, where that is not what it was.
+        - `then`: kinds expected after it, if they have changed.
         """
         if self._at is not None:
             last, began = self._at
@@ -96,21 +96,21 @@ class Pace:
         return sum(map(self._usual, [kind, *self._ahead]))
 
     def _usual(self, kind: str) -> float:
-        """The mean of what pieces of a kind took; of a kind that is new, of all pieces."""
+        """Mean duration of the pieces of a kind; for a new kind, of all pieces."""
         took = self._took.get(kind) or [x for of in self._took.values() for x in of]
         return sum(took) / len(took)
 
 
 @contextlib.contextmanager
 def working(title: str, show: bool = True) -> Iterator[Callable[..., None]]:
-    """Gives a function that replaces the text; silent where there is neither terminal nor notebook.
+    """Gives a function that replaces the text; silent without a terminal or a notebook.
 
-    The function takes the text and, where they are known, the share that is done, 0 to 1, and
-    `left`, the time left in s. How long it has been is shown as well.
+    The function takes the text and, if they are known, the share that is done, 0 to 1, and
+    `left`, the time left in s. The time elapsed is shown as well.
 
     **Arguments:**
 
-    - `title`: before every text.
+    - `title`: shown before every text.
     - `show`: False to stay silent everywhere.
     """
     if not show:
@@ -121,7 +121,7 @@ def working(title: str, show: bool = True) -> Iterator[Callable[..., None]]:
     if handle is not None:
         yield from _in_notebook(line, handle)
         return
-    # Here, since most of a short command's life goes into imports.
+    # Imported here, since imports take most of the time of a short command.
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -147,7 +147,7 @@ def _in_notebook(line: Line, handle: Any) -> Iterator[Callable[..., None]]:
     try:
         yield say
     finally:
-        # What is done needs no line; a display cannot be taken away, only emptied.
+        # A finished task needs no line; a display cannot be removed, only emptied.
         handle.update({"text/html": "", "text/plain": ""}, raw=True)
 
 
@@ -162,13 +162,13 @@ def _html(line: Line) -> dict[str, str]:
 
 
 def live_figure(show: bool = True) -> Callable[[Callable[[], Any]], None]:
-    """Gives a function that draws a figure in a notebook, each in the last one's place.
+    """Gives a function that draws a figure in a notebook; each figure replaces the last one.
 
-    It takes what makes the figure, which is not called outside of a notebook.
+    It takes a function that makes the figure and that is not called outside a notebook.
 
     **Arguments:**
 
-    - `show`: False to draw nothing anywhere.
+    - `show`: False to draw nothing.
     """
     handles: list[Any] = []
 
@@ -178,7 +178,7 @@ def live_figure(show: bool = True) -> Callable[[Callable[[], Any]], None]:
         if not handles:
             handles.append(notebook_output())
         content = {"application/vnd.plotly.v1+json": json.loads(make().to_json())}
-        # JupyterLab leaves a figure as it is where another one takes its place at once.
+        # JupyterLab does not redraw a figure that is replaced directly by another one.
         handles[0].update({"text/plain": ""}, raw=True)
         handles[0].update({**content, "text/plain": "a figure"}, raw=True)
 
@@ -187,7 +187,7 @@ def live_figure(show: bool = True) -> Callable[[Callable[[], Any]], None]:
 
 def in_notebook() -> bool:
     """Whether this process is the kernel of a notebook."""
-    # IPython is imported by nobody but IPython.
+    # A process that is not run by IPython does not import it.
     if "IPython" not in sys.modules:
         return False
     from IPython.core.getipython import get_ipython  # type: ignore[import-not-found]
@@ -196,7 +196,7 @@ def in_notebook() -> bool:
 
 
 def notebook_output() -> Any:
-    """A place in a notebook's output that can be filled anew; None outside of a notebook."""
+    """A display in a notebook's output that can be updated; None outside a notebook."""
     if not in_notebook():
         return None
     from IPython.display import display  # type: ignore[import-not-found]
@@ -213,4 +213,4 @@ def clock(seconds: float) -> str:
 
 
 def silent(text: str, share: float | None = None, left: float | None = None) -> None:
-    """Says nothing."""
+    """Shows nothing."""

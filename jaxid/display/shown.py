@@ -1,4 +1,4 @@
-"""How a result shows itself in a notebook: its table, then its figure."""
+"""Display of results in a notebook: the table, then the figure."""
 
 import abc
 from typing import TYPE_CHECKING
@@ -21,11 +21,11 @@ class AbstractShown(eqx.Module):
         """The table, as HTML."""
 
     def _ipython_display_(self) -> None:
-        # Called by IPython alone, and there is none without a user who has it.
+        # Only IPython calls this method, so it is installed.
         from IPython.core.getipython import get_ipython  # type: ignore[import-not-found]
         from IPython.display import display  # type: ignore[import-not-found]
 
         display({"text/html": self._repr_html_(), "text/plain": repr(self)}, raw=True)
-        # At a terminal a figure would open a browser, which nobody asked for.
+        # On a terminal a figure would open a browser, which is not wanted here.
         if hasattr(get_ipython(), "kernel"):
             display(self.plot())

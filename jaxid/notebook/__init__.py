@@ -1,4 +1,4 @@
-"""Results in hand in a notebook: effects moved by sliders."""
+"""Interactive results in a notebook: effects with sliders."""
 
 from .explorer import Explorer as Explorer
 from .explorer import explore as explore

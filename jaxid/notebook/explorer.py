@@ -1,4 +1,4 @@
-"""A fitted model with an effect moved by hand: what it would say, while the slider moves."""
+"""Interactive exploration: predictions of a fitted model with an effect set by sliders."""
 
 import html
 import time
@@ -29,20 +29,20 @@ def explore(
     joint: int | None = None,
     catalogue: Sequence[Any] = known,
 ) -> "Explorer":
-    """Moves an effect by sliders and shows at once what a fitted model would say with it.
+    """Sets an effect by sliders and shows the predictions of a fitted model with it.
 
     Torque, residual and error follow from the linear system along the runs, in milliseconds. They
     are exact for small effects; *refit in full* simulates the model with the effect and fits it.
-    Effects that part drive and link, limits and delays are simulated, which takes longer.
+    Effects that separate drive and link, limits and delays are simulated, which takes longer.
 
     **Arguments:**
 
-    - `fit`: of a loop that can be simulated.
-    - `validate`: recordings that the fit has not seen.
-    - `effect`, `joint`: where to begin, by its name as in tables; else with the first one.
+    - `fit`: fit of a loop that can be simulated.
+    - `validate`: recordings that were not used in the fit.
+    - `effect`, `joint`: the effect to start with, named as in tables; the first one by default.
     - `catalogue`: as for `diagnose`.
 
-    **Raises:** `ModelError` without the extra `notebook`; `FitError` where the fitted loop cannot
+    **Raises:** `ModelError` without the extra `notebook`; `FitError` if the fitted loop cannot
     be simulated.
     """
     try:
@@ -60,11 +60,11 @@ def explore(
 
 
 class Explorer:
-    """What `explore` shows in a notebook.
+    """The widget that `explore` shows in a notebook.
 
-    - `fit`: the model at hand; after a refit the one with the effect.
-    - `effect`: at the sliders' values.
-    - `answer`: the last answer, and `milliseconds` what it took from slider to figure.
+    - `fit`: the current model; after a refit, the one with the effect.
+    - `effect`: the effect at the values of the sliders.
+    - `answer`: the last answer; `milliseconds` is the time it took from slider to figure.
     """
 
     def __init__(self, fit: Fit, validate: Any, catalogue: Sequence[Any]) -> None:
@@ -149,7 +149,7 @@ class Explorer:
     def move(self, **values: float) -> None:
         """Moves sliders by the names of their parameters.
 
-        **Raises:** `ModelError` where there is no such slider.
+        **Raises:** `ModelError` if there is no such slider.
         """
         sliders = {w.description.split(" (")[0]: w for w in self._sliders.widgets}
         for name, value in values.items():
@@ -158,12 +158,12 @@ class Explorer:
             sliders[name].value = value
 
     def to_best(self) -> None:
-        """Moves the sliders to where the linear system leaves least."""
+        """Moves the sliders to the values that minimise the residual of the linear system."""
         self._say("looking for the best values")
         self._sliders.move_to(self._what_if.best(self.effect))
 
     def refit(self) -> None:
-        """Fits the model with the effect in full and goes on from it."""
+        """Fits the full model with the effect and continues with the result."""
         name = effect_on(self.effect.effect_name(), getattr(self.effect, "joint", None))
         self._say(f"fitting the model with {name} in full")
         self._full.disabled = True
@@ -180,7 +180,7 @@ class Explorer:
             self._full.disabled = False
 
     def _take(self, fit: Fit) -> None:
-        """A fitted model: what can be asked of it, and its recordings."""
+        """Sets a fitted model: the effects on offer and its recordings."""
         self.fit, self._at = fit, None
         self._what_if = WhatIf.of(fit, self._validate, self._catalogue)
         self._before = self._what_if.answer(None)
@@ -233,7 +233,7 @@ class Explorer:
         self._moved()
 
     def _chosen_view(self) -> None:
-        """Another recording or joint to look at."""
+        """Shows another recording or joint."""
         torque, position = self.fit.loop.arm.units()
         turned = self._what_if.predictor.system.row != 0
         joint = self._of.value
@@ -252,7 +252,7 @@ class Explorer:
             self._picture.show(*signals, self._rest, name, unit)
 
     def _moved(self) -> None:
-        """Sliders were moved: the answer, in figure and table."""
+        """Updates the answer, in figure and table, after sliders have moved."""
         if self._at is None or self._picture is None:
             return
         began = time.perf_counter()
@@ -277,7 +277,7 @@ class Explorer:
         from IPython.display import display  # type: ignore[import-not-found]
 
         if self._picture is not None and self._picture.changed:
-            # What was moved before the figure is on the screen is not in it.
+            # Changes made before the figure is on the screen are lost, so it is made again.
             self._picture = None
             self._chosen_view()
         display(self.widget)

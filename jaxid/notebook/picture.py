@@ -1,4 +1,4 @@
-"""The figure of an explorer: torque and residual of one joint, as fitted and with an effect."""
+"""Figure of an explorer: torque and residual of one joint, as fitted and with an effect."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ..display import figures
 
-# Samples of a recording that are drawn: more than a screen has columns, few enough to send at once.
+# Drawn samples of a recording: enough for the columns of a screen, few enough to send quickly.
 _DRAWN = 1500
 # Which traces change with the effect.
 _PREDICTED, _REST = 2, 4
@@ -16,13 +16,13 @@ _PREDICTED, _REST = 2, 4
 class Picture:
     """A plotly widget of one recording and joint, two lines of which follow the effect.
 
-    A widget that is not on a screen yet loses what is changed in it: `changed` says whether there
-    is something to lose.
+    A widget that is not on a screen yet loses changes made to it: `changed` is true if there were
+    any.
 
     **Arguments:**
 
     - `time`: s. `measured`, `simulated`: the model as fitted, in `unit`.
-    - `name`: of the signal, as its axis has it.
+    - `name`: name of the signal on its axis.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Picture:
         name: str,
         unit: str,
     ) -> None:
-        """Another recording or joint, with arguments as for a new one."""
+        """Shows another recording or joint; the arguments are those of the constructor."""
         time, before, left, rest = self._drawn(time, measured, measured - simulated, rest)
         self.changed = True
         lines = before, before - left, before - rest, left, rest
@@ -75,7 +75,7 @@ class Picture:
             self.widget.layout.yaxis2.range = _around(left)
 
     def follow(self, rest: Float[np.ndarray, " rows"]) -> None:
-        """Draws what the model says with the effect.
+        """Draws the prediction of the model with the effect.
 
         **Arguments:**
 
@@ -98,7 +98,7 @@ class Picture:
 
 
 def _around(residual: np.ndarray) -> list[float]:
-    """A fixed axis for a residual: one that followed it would hide how it changes."""
+    """A fixed axis range for a residual; automatic scaling would hide its changes."""
     low, high = float(residual.min()), float(residual.max())
     room = 0.4 * (high - low)
     return [low - room, high + room]

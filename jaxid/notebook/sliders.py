@@ -11,12 +11,12 @@ from ..effects import AbstractEffect
 from ..parameters import read_values, write_values
 from ..simulation.loop import ClosedLoop
 
-# Ratio of ends from which a slider counts in powers of ten, and its steps from end to end.
+# Ratio of the ends above which a slider is logarithmic, and its number of steps.
 _LOG, _STEPS = 10.0, 400
 
 
 class Sliders:
-    """Sliders that hold the values of one effect, and the effect that they make."""
+    """Sliders for the values of one effect, and the effect at these values."""
 
     def __init__(
         self,
@@ -38,13 +38,13 @@ class Sliders:
 
     @property
     def effect(self) -> AbstractEffect:
-        """The effect at the sliders' values."""
+        """The effect at the values of the sliders."""
         values = jnp.asarray([float(slider.value) for slider in self.widgets])
         return write_values(self._effect, self._free, values) if self._free else self._effect
 
     def move_to(self, effect: AbstractEffect) -> None:
-        """Puts the sliders at another effect's values; their ends give way where they must."""
-        # One answer for all of them, and none for each.
+        """Sets the sliders to the values of another effect; their ranges are widened if needed."""
+        # One answer for all sliders together instead of one for each.
         self._quiet = True
         try:
             for slider, value in zip(

@@ -1,3 +1,3 @@
-"""The page that tells a discovery to a colleague: one HTML file that needs nothing else."""
+"""Reports of discoveries: each is one self-contained HTML file."""
 
 from ._page import write_report as write_report

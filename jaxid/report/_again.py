@@ -1,4 +1,4 @@
-"""What it takes to do the same again: versions, recordings and settings."""
+"""Data needed to reproduce a discovery: versions, recordings and settings."""
 
 import hashlib
 import json
@@ -14,7 +14,7 @@ from ._html import Content, Markup, details, join, number, section, table, tag
 
 
 def settings(story: Discovery) -> Markup:
-    """Versions, recordings and settings, so that another can do it again."""
+    """Versions, recordings and settings needed to reproduce the discovery."""
     fit = story.steps[0].fit
     packages = ("jaxid-robotics", "jax", "jaxlib", "diffrax", "equinox", "numpy", "scipy")
     facts = [
@@ -34,7 +34,7 @@ def settings(story: Discovery) -> Markup:
         recordings += [["held out", *_recording(r)] for r in held.recordings]
     columns = ["used", "recording", "samples", "duration, s", "rate, Hz", "SHA-256 of its numbers"]
     told = json.dumps(_plain(story.to_dict()), indent=1, ensure_ascii=False)
-    # It scrolls, and the keyboard reaches what scrolls.
+    # The element scrolls, so it must be reachable by keyboard.
     whole = tag("pre", told, tabindex="0", role="region", aria_label="the story as JSON")
     said = join("The story as ", tag("code", "jaxid discover --json"), " writes it")
     return section(
@@ -47,7 +47,7 @@ def settings(story: Discovery) -> Markup:
 
 
 def _reach(story: Discovery) -> Markup:
-    """Ranges of the fitted recordings, beyond which nothing has been seen."""
+    """Ranges of the fitted recordings; there are no data beyond them."""
     limits = Limits.of(story.fit.recordings)
     torque, position = story.loop.arm.units()
     rows: list[list[Content]] = [

@@ -1,4 +1,4 @@
-"""The first and the last model beside the recordings that the page shows."""
+"""The first and the last model compared with the recordings that the page shows."""
 
 import dataclasses
 
@@ -11,9 +11,9 @@ from ..discovery.story import Step
 
 @dataclasses.dataclass(frozen=True)
 class Beside:
-    """The starting and the final model along recordings: held-out ones where there are any.
+    """The starting and the final model compared with recordings, held-out ones if available.
 
-    - `unseen`: whether no fit has seen the recordings.
+    - `unseen`: whether the recordings were used in no fit.
     """
 
     story: Discovery
@@ -23,7 +23,7 @@ class Beside:
 
     @staticmethod
     def of(story: Discovery) -> "Beside":
-        """The models of a story; what was not compared when it was made is simulated now."""
+        """The models of a story; comparisons that the story does not contain are simulated now."""
         first, last = story.steps[0], story.steps[-1]
         unseen = all(step.held_out is not None for step in story.steps)
         before = _compared(first, unseen)
@@ -32,7 +32,7 @@ class Beside:
 
     @property
     def several(self) -> bool:
-        """Whether there is a model before and another after."""
+        """Whether the starting and the final model differ."""
         return self.before is not self.after
 
     @property
@@ -42,14 +42,14 @@ class Beside:
 
     @property
     def floor(self) -> Float[np.ndarray, "recordings joints"]:
-        """Relative error that noise alone would leave, %; as on the fitted recordings."""
+        """Relative error due to noise alone, %, as estimated on the fitted recordings."""
         story = self.story
         if not self.unseen:
             return story.diagnosis.floor
         return np.broadcast_to(story.noise_floor_percent(), self.error.shape)
 
     def noise(self, recording: int) -> Float[np.ndarray, " joints"]:
-        """Deviation of each joint's noise, in the unit of the signal."""
+        """Standard deviation of each joint's noise, in the unit of the signal."""
         measured = self.after.judged(recording)[1]
         return self.floor[recording] / 100 * np.sqrt(np.mean(measured**2, axis=0))
 
@@ -60,12 +60,12 @@ class Beside:
 
     @property
     def worst(self) -> int:
-        """The recording on which the final model leaves most over its noise."""
+        """The recording with the largest ratio of the final model's error to the noise floor."""
         return int(np.argmax(np.max(self.ratio, axis=1)))
 
     @property
     def lead(self) -> int:
-        """The joint, from 0, whose error fell most; of a single model the one it fails most."""
+        """Index of the joint whose error fell most; for a single model, the joint it fits worst."""
         k = self.worst
         if not self.several:
             return int(np.argmax(self.ratio[k]))

@@ -7,11 +7,11 @@ from ._html import Content, Markup, figure, section, tag
 
 
 def effects(story: Discovery) -> Markup | None:
-    """The torque of each added effect over what it depends on; None where nothing was added."""
+    """The torque of each added effect over what it depends on; None if no effect was added."""
     count = len(story.steps) - 1
     if not count:
         return None
-    # What was added stands last in the loop.
+    # Added effects are the last ones of the loop.
     drawn = [_curve(story, effect) for effect in story.loop.effects[-count:]]
     return section("Effect that was found" if count == 1 else "Effects that were found", *drawn)
 

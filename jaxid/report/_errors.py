@@ -16,12 +16,13 @@ from ._models import where_table
 from ._signals import misfits
 
 LAGS = 38
-# Error over the noise floor up to which a joint is described: a tenth more is seen in a figure.
+# Ratio of error to noise floor below which a joint counts as described by the model: an excess of
+# a tenth is visible in a figure.
 NEAR = 1.1
 
 
 def errors(beside: Beside) -> Markup:
-    """Relative errors of recordings and joints by step, beside the noise floor."""
+    """Relative errors of recordings and joints by step, with the noise floor."""
     story = beside.story
     fitted = [step.fit.error_percent.to_numpy() for step in story.steps]
     rows = _rows("fitted", story.fit.recordings.names, fitted, story.diagnosis.floor)
@@ -54,7 +55,7 @@ def _rows(
 
 
 def rest(beside: Beside) -> Markup:
-    """Where the final model still fails, and whether what it leaves is noise."""
+    """Where the final model still fails, and whether its residual is noise."""
     story, held = beside.story, beside.after
     pieces: list[Content] = [tag("p", _verdict(beside))]
     columns = [
@@ -148,7 +149,7 @@ def against(held: Comparison, where: Verdict, model: str) -> Markup:
         kind = curve.coordinate
         way = run.time if kind == "t" else np.asarray(getattr(run, kind))[:, curve.of - 1]
         sign = np.sign(np.asarray(run.v)[kept, joint - 1]) if curve.signed else 1.0
-        # Where the joint stands still nothing was compared.
+        # Samples at which the joint stands still are not compared.
         moves = left[:, joint - 1] != 0
         x.append(np.asarray(way)[kept][moves])
         y.append((left[:, joint - 1] * sign)[moves])

@@ -1,4 +1,4 @@
-"""The page's head: the verdict, what was asked, and what was found."""
+"""The head of the page: the verdict, the question, and the effects that were found."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ WORDS = {
 
 
 def head(story: Discovery) -> Markup:
-    """The verdict, what was asked, and what was found."""
+    """The verdict, the question, and the effects that were found."""
     badge = tag("span", WORDS[story.verdict], class_=f"badge {story.verdict}")
     kicker = tag("p", "jaxid discover: ", tag("b", story.loop.name), " ", badge, class_="kicker")
     # A reason is too long for a headline.

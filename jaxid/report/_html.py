@@ -1,4 +1,4 @@
-"""HTML put together so that nothing from a file or a user gets in unescaped."""
+"""Generation of HTML in which all text from files and users is escaped."""
 
 import html
 import math
@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 
 
 class Markup(str):
-    """Text that is HTML already; every other string is escaped on its way in."""
+    """Text that is already HTML; every other string is escaped when it is inserted."""
 
 
 class Cell(Markup):
@@ -29,7 +29,7 @@ def tag(name: str, *content: Content, **attributes: Content) -> Markup:
 
 
 def join(*content: Content) -> Markup:
-    """Pieces one after the other, escaped unless they are markup; None is left out."""
+    """Concatenated pieces, escaped unless they are markup; None is left out."""
     return Markup(
         "".join(
             piece if isinstance(piece, Markup) else html.escape(str(piece))
@@ -42,13 +42,13 @@ def join(*content: Content) -> Markup:
 def table(
     columns: Sequence[str], rows: Sequence[Sequence[Content]], caption: str | None = None
 ) -> Markup:
-    """A table whose columns sort on a click; numbers are shown short and sorted in full."""
+    """A table with columns that sort on a click; displayed numbers are rounded, sorting is not."""
     buttons = (tag("button", name, type="button") for name in columns)
     head = tag("tr", *(tag("th", button, scope="col") for button in buttons))
     body = [tag("tr", *(_cell(value) for value in row)) for row in rows]
     title = None if caption is None else tag("caption", caption)
     whole = tag("table", title, tag("thead", head), tag("tbody", *body))
-    # A wide table scrolls in its own box, so that a narrow page does not; the keyboard reaches it.
+    # A wide table scrolls in its own box, so that a narrow page does not; the box takes the focus.
     return tag("div", whole, class_="scroll", tabindex="0", role="region", aria_label=caption)
 
 
@@ -61,26 +61,26 @@ def _cell(value: Content) -> Markup:
 
 
 def cell(shown: Content, value: float, class_: str = "number") -> Cell:
-    """A number shown in words of one's own, sorted by its value."""
+    """A number shown as a given text and sorted by its value."""
     return Cell(tag("td", shown, class_=class_, data_value=repr(float(value))))
 
 
 def bar(shown: Content, value: float, share: float) -> Cell:
-    """A number with a bar of a length between 0 and 1 below it."""
+    """A number with a bar below it; the length of the bar is between 0 and 1."""
     width = 100 * min(max(share, 0.0), 1.0) if math.isfinite(share) else 0.0
     drawn = tag("span", class_="bar", style=f"width:{width:.1f}%")
     return cell(join(shown, drawn), value, "number barred")
 
 
 def number(value: float) -> str:
-    """A number as one reads it: four digits, and a dash where there is none."""
+    """A number formatted with four digits; a dash if there is none."""
     if not math.isfinite(value):
         return "–" if math.isnan(value) else ("∞" if value > 0 else "−∞")
     return f"{value:.4g}".replace("-", "−")
 
 
 def with_deviation(value: float, std: float | None) -> str:
-    """A value and its standard deviation of two digits, to the same place."""
+    """A value and its standard deviation, which has two digits, to the same decimal place."""
     if std is None or not math.isfinite(std) or std <= 0:
         return number(value)
     digits = 1 - math.floor(math.log10(std))
@@ -90,22 +90,22 @@ def with_deviation(value: float, std: float | None) -> str:
 
 
 def percent(share: float) -> str:
-    """A percentage of three digits."""
+    """A percentage with three digits."""
     return f"{share:.{2 if share < 10 else 1 if share < 100 else 0}f}"
 
 
 def probability(p: float) -> str:
-    """A p-value; one below what float64 holds is said to be small, not zero."""
+    """A p-value; one that underflows float64 is given as small, not as zero."""
     return "< 1e−300" if p < 1e-300 else number(float(f"{p:.2g}"))
 
 
 def details(summary: Content, *content: Content, class_: str | None = None) -> Markup:
-    """What only some readers want, folded away; printed nevertheless, unless it is `raw`."""
+    """Collapsed content for some readers; it is printed unless it is `raw`."""
     return tag("details", tag("summary", summary), *content, class_=class_)
 
 
 def choose(name: str, title: str, labels: Sequence[Content], first: int) -> Markup:
-    """A choice of one of several, each in words; the page's script shows the chosen panel."""
+    """A choice between labelled options; the page's script shows the panel of the chosen one."""
     options = [
         tag(
             "label",
@@ -121,7 +121,7 @@ def choose(name: str, title: str, labels: Sequence[Content], first: int) -> Mark
 
 
 def link(text: Content, anchor: str) -> Markup:
-    """A link to a place on the page."""
+    """A link to an anchor on the page."""
     return tag("a", text, href=f"#{anchor}")
 
 
@@ -144,17 +144,17 @@ def figure(drawn: go.Figure, caption: Content, linked: bool = False) -> Markup:
         role="group",
         aria_label=f"{caption}{keys if linked else ''}",
     )
-    # Nothing that a figure holds can end the script early.
+    # Escaped, so that no text in a figure can end the script early.
     data = Markup((drawn.to_json() or "").replace("<", "\\u003c"))
     script = tag("script", data, type="application/json")
     return tag("figure", box, script, tag("figcaption", caption))
 
 
 def section(title: str, *content: Content) -> Markup:
-    """A section under its heading."""
+    """A section with its heading."""
     return tag("section", tag("h2", title), *content, id=anchor(title))
 
 
 def anchor(title: str) -> str:
-    """What a link to a section calls it."""
+    """The anchor of a section, made from its title."""
     return "-".join("".join(c if c.isalnum() else " " for c in title.lower()).split())

@@ -1,4 +1,4 @@
-"""The models that were looked at, and what the catalogue's effects would have explained."""
+"""The models that were compared, and what the effects of the catalogue would explain."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ SHOWN = 12
 
 
 def models(story: Discovery) -> Markup:
-    """The models with their weights, and why each effect was chosen over its rivals."""
+    """The models with their weights, and why each effect was chosen over its alternatives."""
     pieces: list[Content] = []
     if story.considered:
         pieces.append(_weights(story))
@@ -54,12 +54,12 @@ def _weights(story: Discovery) -> Markup:
 
 
 def _percent(errors: np.ndarray | None) -> str:
-    # A line breaks between joints, not within a number.
+    # Lines may break between joints but not within a number.
     return "" if errors is None else ", ".join(f"{x:.2f}" for x in errors)
 
 
 def _reason(diagnosis: Diagnosis | None, step: Step) -> str:
-    """The choice in words: what the effect explains, and how far behind the next one is."""
+    """The choice in words: what the effect explains, and the distance to the next effect."""
     if diagnosis is None or step.added is None:
         return "It was added together with the effect before it."
     key = (step.added.effect_name(), getattr(step.added, "joint", None))
@@ -98,7 +98,7 @@ def _alike(step: Step) -> Markup:
 
 
 def _screened(diagnosis: Diagnosis, step: Step) -> Markup:
-    """What each effect of the catalogue would explain beyond a step's model."""
+    """What each effect of the catalogue would explain in addition to a step's model."""
     leader = diagnosis.ranking[0] if diagnosis.ranking else None
     top = diagnosis.ranking[:15]
     told = diagnosis.table().head(len(top)).to_dict("records")
@@ -142,12 +142,12 @@ def _screened(diagnosis: Diagnosis, step: Step) -> Markup:
 
 
 def _unbroken(amplitudes: str) -> str:
-    """Amplitudes that a line breaks between, not within."""
+    """Amplitudes; lines may break between them but not within one."""
     return ", ".join(one.replace(" ", "\u00a0") for one in amplitudes.split(", "))
 
 
 def where_table(diagnosis: Diagnosis) -> Markup:
-    """Free-form curves: on what the torque of which joint depends beyond the model."""
+    """Free-form curves: the coordinates on which each joint's unexplained torque depends."""
     rows = []
     shares = diagnosis.where_table()["explained_percent"]
     for verdict, share in list(zip(diagnosis.where, shares, strict=True))[:10]:

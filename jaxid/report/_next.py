@@ -1,4 +1,4 @@
-"""What to record next, where that would change the verdict."""
+"""What to record next, if that can change the verdict."""
 
 from ..discovery import Discovery, next_experiment
 from ..discovery.diagnosis import Diagnosis, Verdict
@@ -9,7 +9,7 @@ from ._html import Content, Markup, figure, number, section, tag
 
 
 def ahead(story: Discovery) -> Markup | None:
-    """A reference that tells apart what these recordings cannot; None where nothing is open."""
+    """A reference to distinguish effects that these recordings cannot; None if there are none."""
     asked = _open_question(story)
     if asked is None:
         return None
@@ -17,10 +17,10 @@ def ahead(story: Discovery) -> Markup | None:
 
 
 def _open_question(story: Discovery) -> tuple[Diagnosis, list[Verdict], str] | None:
-    """Effects that the next recording should tell apart, on which diagnosis, and why."""
+    """The diagnosis, the effects that the next recording should distinguish, and the reason."""
     diagnosis = None
     for before, step in zip(story.steps, story.steps[1:], strict=False):
-        # A model between two steps may never have been linearised; the one before it was.
+        # An intermediate model may not have been linearised; the diagnosis before it is used then.
         diagnosis = before.diagnosis or diagnosis
         if not step.alike or step.added is None or diagnosis is None:
             continue
@@ -42,7 +42,7 @@ def _experiment(diagnosis: Diagnosis, effects: list[Verdict], why: str) -> list[
     except JaxidError as error:
         return [tag("p", f"{why} No reference can be proposed: {error}.", class_="note")]
     if proposed.then < DECISIVE or proposed.then < proposed.now:
-        # It would leave the verdict as it is.
+        # The recording would not change the verdict.
         said = f"{why} No reference within the limits reached so far would tell them apart."
         return [tag("p", said)]
     unit = diagnosis.fit.loop.arm.units()[1]

@@ -1,4 +1,4 @@
-"""One file that opens without a network."""
+"""The page as one HTML file that needs no network."""
 
 from importlib import resources
 from pathlib import Path
@@ -14,12 +14,12 @@ def write_report(story: Discovery, path: str | Path) -> Path:
 
     **Arguments:**
 
-    - `story`: what `jaxid.discover` gave.
+    - `story`: the result of `jaxid.discover`.
     - `path`: the file to write; its folder must exist.
 
     **Returns:** the path.
 
-    **Raises:** `ModelError` where the folder does not exist.
+    **Raises:** `ModelError` if the folder does not exist.
     """
     path = Path(path)
     if not path.resolve().parent.is_dir():
@@ -36,7 +36,7 @@ def page(story: Discovery) -> str:
         Markup('<meta charset="utf-8">'),
         Markup('<meta name="viewport" content="width=device-width, initial-scale=1">'),
         Markup('<meta name="color-scheme" content="light dark">'),
-        # What is not in the file is not fetched, whatever a browser extension or a figure tries.
+        # The page fetches nothing from the network, even if a figure or browser extension tries to.
         Markup(
             '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
             "script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:\">"
@@ -49,7 +49,7 @@ def page(story: Discovery) -> str:
         tag("style", Markup(_part("page.css"))),
     )
     without = tag("noscript", tag("p", "The figures need JavaScript.", class_="note"))
-    # Text of no language: the browser does not run it, the page's own script does when it draws.
+    # Plain text, so that the browser does not run it; the page's script runs it when it draws.
     library = tag("script", Markup(get_plotlyjs()), type="text/plain", data_library="")
     script = tag("script", Markup(_part("page.js")))
     content = tag("body", tag("main", without, body(story)), library, script)

@@ -1,4 +1,4 @@
-"""Parameters of the starting and of the final model, and by how much they moved."""
+"""Parameters of the starting and the final model, and their changes."""
 
 import math
 
@@ -8,7 +8,7 @@ from ._html import Content, Markup, bar, cell, join, number, section, table, tag
 
 
 def parameters(story: Discovery) -> Markup:
-    """Every parameter before and after, with its shift in deviations."""
+    """All parameters before and after, with their shifts in standard deviations."""
     first, last = story.steps[0].fit, story.fit
     several = len(story.steps) > 1
     before, after = _values(first), _values(last)
@@ -60,7 +60,7 @@ def _shown(known: tuple[float, float] | None, absent: str) -> Content:
 
 
 def _shift(shift: float, most: float) -> Content:
-    # A root, so that a shift of three is seen beside one of three hundred.
+    # Square root, so that a shift of three is still visible next to one of three hundred.
     return bar(f"{shift:+.1f}".replace("-", "−"), shift, math.sqrt(abs(shift) / most))
 
 

@@ -16,7 +16,7 @@ from ._signals import signals
 
 
 def body(story: Discovery) -> Markup:
-    """The verdict, the picture that shows it, and then what supports it."""
+    """The verdict, the main figure, and then the supporting sections."""
     beside = Beside.of(story)
     first = signals(beside)
     after = [

@@ -8,16 +8,17 @@ from ..display import figures
 from ._beside import Beside
 from ._html import Markup, choose, figure, join, percent, section, tag
 
-# Points of a line over all joints of the page: the page is to be small, a joint alone sharp.
+# Points of a line, in total over all joints: this limits the size of the page, and a single joint
+# is drawn in full detail.
 POINTS = 12_000
-# A stretch counts as misfit where its residual is this many times what noise leaves.
+# A stretch is a misfit if its RMS residual exceeds this multiple of the noise.
 BEYOND = 2.0
 # Share of a recording up to which misfits are marked.
 MARKED = 0.4
 
 
 def signals(beside: Beside) -> Markup:
-    """Measured and simulated on one axis with the residual below, one figure a joint."""
+    """Measured and simulated on one axis with the residual below, one figure per joint."""
     held, k = beside.after, beside.worst
     seen = "which no fit has seen" if beside.unseen else "which was fitted"
     many = len(held.recordings)
@@ -33,7 +34,7 @@ def signals(beside: Beside) -> Markup:
 
 
 def _cards(beside: Beside) -> Markup:
-    """Errors of all joints; where there are several, each shows its figure."""
+    """Errors of all joints; with several joints, each card selects the figure of its joint."""
     before = beside.before.error_percent.to_numpy()[beside.worst]
     after, floor = beside.error[beside.worst], beside.floor[beside.worst]
     rows = []
@@ -80,7 +81,7 @@ def _figure(beside: Beside, joint: int) -> Markup:
         most=min(figures.MAX_POINTS, POINTS // held.loop.joints),
     )
     found = misfits(time, np.nan_to_num(measured - after), noise)
-    # To mark most of a figure would say nothing; the table of what is left has the share.
+    # Marks over most of a figure carry no information; the table of residuals has the share.
     if sum(end - start for start, end in found) < MARKED * (time[-1] - time[0]):
         figures.mark_misfit(drawn, 1, found, name="beyond noise")
     models = "before and after the effects were added" if beside.several else "by the model"
@@ -97,8 +98,8 @@ def misfits(
 ) -> list[tuple[float, float]]:
     """Stretches in which a residual is larger than its noise, as start and end in s.
 
-    A moving mean square over a hundredth of the recording (21 samples at the least) is held
-    against the noise's; stretches closer than that are one.
+    A moving mean square over a hundredth of the recording (at least 21 samples) is compared
+    with that of the noise; stretches closer together than that are merged.
     """
     width = max(21, len(time) // 100)
     if noise <= 0 or len(time) < width:

@@ -1,8 +1,8 @@
-"""Drawings of plain arrays with names and units; every function returns a plotly figure.
+"""Figures of plain arrays with names and units; every function returns a plotly figure.
 
-Colours and text are of middle luminance and the page shows through, so one figure reads on a light
-page and on a dark one; what differs in colour also differs in width, dash, marker or pattern, so
-it reads in grey as well.
+Colours and text have medium luminance and the background is transparent, so that a figure is
+legible on light and dark pages. Elements that differ in colour also differ in width, dash, marker
+or pattern, so that a figure is legible in grey.
 """
 
 from .along_time import before_after as before_after

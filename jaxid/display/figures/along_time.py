@@ -1,4 +1,4 @@
-"""Signals over time."""
+"""Figures of signals over time."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -43,8 +43,8 @@ def signals(
     Arguments:
         time: Sampling times in s, shape `(samples,)`.
         panels: Top to bottom, the traces of each panel; a panel of residuals only is half as high.
-        titles: What each panel shows ("joint 1 torque"); the first trace's name if absent.
-        title: Of the whole figure.
+        titles: Titles of the panels ("joint 1 torque"); the first trace's name if absent.
+        title: Title of the whole figure.
     """
     if not panels or not all(panels):
         raise ValueError("signals() draws panels of at least one trace each; one is empty.")
@@ -72,7 +72,7 @@ def comparison(
     unit: str | Sequence[str],
     title: str | None = None,
 ) -> go.Figure:
-    """Draw per joint measured, simulated and residual, and the residual's autocorrelation.
+    """Draw measured, simulated and residual signals and the residual's autocorrelation per joint.
 
     Arguments:
         time: Sampling times in s, shape `(samples,)`.
@@ -82,8 +82,8 @@ def comparison(
         acf: Autocorrelation of the residual from lag 0 on, shape `(lags, joints)`.
         acf_bound: Two standard deviations of a white residual's autocorrelation.
         joint_names: As printed, one for each joint.
-        unit: Of the signal, one for all joints or one for each.
-        title: Of the whole figure.
+        unit: Unit of the signal, one for all joints or one for each.
+        title: Title of the whole figure.
     """
     if len(acf) < 2 or np.any(np.abs(acf[0] - 1) > 1e-6):
         raise ValueError("comparison() takes the autocorrelation from lag 0, where it is 1.")
@@ -108,7 +108,7 @@ def comparison(
         drawn += upper + lower
     shade_gaps(figure, time, drawn, "not compared")
     for row in range(1, 2 * joints + 1):
-        # An axis that matches itself is what plotly warns of in a browser's console.
+        # Plotly warns in the browser's console about an axis that matches itself.
         figure.update_xaxes(matches="x" if row > 1 else None, showticklabels=False, row=row, col=1)
     figure.update_xaxes(title_text="time (s)", showticklabels=True, row=2 * joints, col=1)
     figure.update_xaxes(showticklabels=False, col=2)
@@ -129,23 +129,23 @@ def before_after(
     most: int = MAX_POINTS,
     title: str | None = None,
 ) -> go.Figure:
-    """Draw a measured signal with what one model or two simulate, and below what they leave of it.
+    """Draw a measured signal with simulations of one or two models, and the residuals below.
 
     Arguments:
         time: Sampling times in s, shape `(samples,)`.
         measured: In `unit`, shape `(samples,)`.
         simulated: By the model at the end, in `unit`, shape `(samples,)`.
-        before: By the model at the start, where there is one, in `unit`, shape `(samples,)`.
+        before: By the model at the start, if there is one, in `unit`, shape `(samples,)`.
         band: Half-width in `unit` of the band in which noise alone would lie.
-        name: What is drawn.
+        name: Name of the signal.
         unit: As printed.
-        most: How many points a line has at the most.
-        title: Of the whole figure.
+        most: Maximum number of points of a line.
+        title: Title of the whole figure.
     """
     figure = go.Figure().set_subplots(
         rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[1.0, 0.7]
     )
-    # Each line is thinner than the one below it, so that all of them are seen where they agree.
+    # Each line is thinner than the one below it, so that all are visible where they agree.
     lines = [("measured", measured, ROLE_LINES["measured"]["color"], 4.5)]
     if before is not None:
         lines.append(("before", before, ORANGE, 2.2))
@@ -175,10 +175,10 @@ def mark_misfit(
     """Shade stretches of one joint in a comparison; the longest 40 are drawn.
 
     Arguments:
-        figure: What `comparison` gave; it is changed.
+        figure: Figure made by `comparison`; it is modified.
         joint: Counted from 1.
         spans: Start and end of each stretch, s.
-        name: What the legend calls them.
+        name: Name of the stretches in the legend.
     """
     longest = sorted(spans, key=lambda span: span[0] - span[1])[:MAX_GAPS]
     for row in (2 * joint - 1, 2 * joint):
@@ -201,17 +201,17 @@ def shares_in_time(
     unit: str = "N·m",
     title: str | None = None,
 ) -> go.Figure:
-    """Draw a residual with what the first rival explains of it, each rival's share, and the rest.
+    """Draw a residual, the part the first candidate explains, each candidate's share and the rest.
 
     Arguments:
         time: Sampling times in s, shape `(samples,)`.
         residual: In `unit`, shape `(samples,)`.
-        shares: What each rival alone explains of it, in `unit`, shape `(samples,)`, by its name,
+        shares: The part each candidate alone explains, in `unit`, shape `(samples,)`, by its name,
             the leading one first.
         unit: As printed.
-        title: Of the whole figure.
+        title: Title of the whole figure.
     """
-    # Rivals stand in for each other: to add them up would explain the same thing twice.
+    # The candidates are alternatives: their sum would count the same part twice.
     leading, explained = next(iter(shares.items()), ("nothing", np.zeros_like(residual)))
     figure = go.Figure().set_subplots(
         rows=3, cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=[1.0, 1.0, 0.6]
@@ -229,7 +229,7 @@ def shares_in_time(
     add_panel(figure, time, [rest], 3)
     for row, name in enumerate(("residual", "share", "rest"), start=1):
         figure.update_yaxes(title_text=with_unit(name, unit), row=row, col=1)
-    # One scale for all three, so that a share is seen against the whole.
+    # One scale for all three, so that a share can be compared with the whole.
     figure.update_yaxes(matches="y")
     shade_gaps(figure, time, whole)
     figure.update_xaxes(title_text="time (s)", row=3, col=1)

@@ -1,4 +1,4 @@
-"""Estimates: parameters with their deviations, likelihood profiles, candidates."""
+"""Figures of estimates: parameters with deviations, likelihood profiles, candidates."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ def parameters(
     *,
     title: str | None = None,
 ) -> go.Figure:
-    """Draw one row a parameter: two standard deviations either side, relative to the value.
+    """Draw one row per parameter: two standard deviations on either side, relative to the value.
 
     Arguments:
         names: Symbols, one for each parameter.
@@ -26,11 +26,11 @@ def parameters(
         stds: Standard deviations in `units`, shape `(parameters,)`.
         units: Unit of each parameter, as printed.
         truth: Known or published values in `units`, shape `(parameters,)`.
-        title: Of the whole figure.
+        title: Title of the whole figure.
     """
     figure = go.Figure()
     place = np.arange(len(names), dtype=float)
-    # A value of zero has no relative deviation; its own standard deviation is the next best scale.
+    # A value of zero has no relative deviation, so it is scaled by its standard deviation.
     scale = np.where(values != 0, np.abs(values), np.where(stds > 0, stds, 1.0)) / 100
     figure.add_scatter(
         x=np.zeros(len(names)),
@@ -67,16 +67,16 @@ def deviance(
     *,
     title: str | None = None,
 ) -> go.Figure:
-    """Draw a likelihood profile beside the parabola that its deviation promises.
+    """Draw a likelihood profile with the parabola predicted by the standard deviation.
 
     Arguments:
-        values: At which the parameter was held, shape `(points,)`, in `unit`.
-        lost: Deviance there, shape `(points,)`.
+        values: Fixed values of the parameter, shape `(points,)`, in `unit`.
+        lost: Deviance at these values, shape `(points,)`.
         centre: The estimate, in `unit`.
         std: Its standard deviation, in `unit`.
-        name: Of the parameter.
-        unit: Of the parameter.
-        title: Of the whole figure.
+        name: Name of the parameter.
+        unit: Unit of the parameter.
+        title: Title of the whole figure.
     """
     figure = go.Figure()
     x = np.linspace(min(values[0], centre - 3 * std), values[-1], 121)
@@ -106,9 +106,9 @@ def differences(
         labels: One for each row.
         values: Differences in `x_unit`, shape `(rows,)`.
         half: Half-widths of their intervals in `x_unit`, shape `(rows,)`.
-        x_name: What the differences are of.
+        x_name: Name of the quantity whose differences are drawn.
         x_unit: Unit, as printed.
-        title: Of the whole figure.
+        title: Title of the whole figure.
     """
     figure = go.Figure()
     place = np.arange(len(labels), dtype=float)
@@ -141,11 +141,11 @@ def ranking(
 
     Arguments:
         labels: One for each candidate.
-        explained: What each explains, in `x_unit`, shape `(candidates,)`.
-        significant: Whether that is more than chance, shape `(candidates,)`.
-        x_name: What the bars measure.
+        explained: Amount that each explains, in `x_unit`, shape `(candidates,)`.
+        significant: Whether that amount is significant, shape `(candidates,)`.
+        x_name: Name of the quantity that the bars show.
         x_unit: Unit, as printed.
-        title: Of the whole figure.
+        title: Title of the whole figure.
     """
     figure = go.Figure()
     place = np.arange(len(labels), dtype=float)

@@ -1,4 +1,4 @@
-"""How all figures look: colours, the theme, axis titles, bars and legends."""
+"""Common style of all figures: colours, the theme, axis titles, bars and legends."""
 
 from functools import cache
 from typing import Any
@@ -81,12 +81,12 @@ def finish(figure: go.Figure, title: str | None, *, height: int, legend: bool) -
 
 
 def with_unit(name: str, unit: str) -> str:
-    """Give an axis title; a pure number has no unit to print."""
+    """Give an axis title; the unit of a dimensionless quantity is not printed."""
     return f"{name} ({unit})" if unit and unit != "1" else name
 
 
 def bar(colour: str, pattern: str) -> dict:
-    """Give a bar its colour at edge and hatching, pale inside so that a line across it is seen."""
+    """Give a bar coloured edges and hatching, and a pale fill so that lines across it are seen."""
     red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
     return {
         "color": f"rgba({red},{green},{blue},{0.15 if pattern else 0.4})",
@@ -96,7 +96,7 @@ def bar(colour: str, pattern: str) -> dict:
 
 
 def floor_line(name: str = "noise floor", colour: str = INK) -> dict:
-    """Give how a noise floor is drawn."""
+    """Give the line style of a noise floor."""
     return {
         "name": name,
         "mode": "lines",

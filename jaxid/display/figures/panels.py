@@ -14,7 +14,7 @@ Role = Literal["measured", "simulated", "residual", "reference", "band"]
 MAX_POINTS = 4000
 MAX_GAPS = 40
 
-# The measured line is wide and pale so that the thin simulated one is seen on top of it.
+# The measured line is wide and pale so that the thin simulated one is visible on top of it.
 ROLE_LINES: dict[str, dict] = {
     "measured": {"color": "rgba(128,134,145,0.75)", "width": 3.2},
     "simulated": {"color": BLUE, "width": 1.4},
@@ -28,10 +28,10 @@ class Trace:
     """One line of a panel, or a band between two lines.
 
     Arguments:
-        name: What the legend calls it.
+        name: Name in the legend.
         values: Samples in `unit`; for the role "band" two columns, lower and upper.
         unit: Unit, as printed.
-        role: What it is, which decides how it is drawn.
+        role: Role of the line, which determines its style.
     """
 
     name: str
@@ -41,7 +41,7 @@ class Trace:
 
 
 def add_panel(figure: go.Figure, time: np.ndarray, traces: Sequence[Trace], row: int) -> None:
-    """Add traces to the left column's panel, once to the legend for each name."""
+    """Add traces to the panel of the left column; each name is in the legend once."""
     present: Any = figure.data
     seen = {trace.name for trace in present}
     roles: list[str] = []
@@ -52,7 +52,7 @@ def add_panel(figure: go.Figure, time: np.ndarray, traces: Sequence[Trace], row:
         else:
             x, y = decimated(x, y)
             line = dict(ROLE_LINES[trace.role])
-            # A second line of the same role in one panel differs by its dash.
+            # A second line of the same role in one panel has another dash pattern.
             line.setdefault("dash", DASHES[roles.count(trace.role) % len(DASHES)])
             drawn = go.Scatter(x=x, y=y, name=trace.name, mode="lines", line=line)
         drawn.update(legendgroup=trace.name, showlegend=trace.name not in seen)
@@ -87,7 +87,7 @@ def add_acf(
 def band_trace(name: str, x: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> go.Scatter:
     """Give a band as one outline for each stretch without missing values."""
     every = -(-len(x) // MAX_POINTS)
-    # A missing sample must survive the thinning, or the outline would close over the gap.
+    # Missing samples must remain after thinning, or the outline would close over the gap.
     whole = np.isfinite(lower) & np.isfinite(upper)
     kept = np.unique(np.concatenate([np.arange(0, len(x), every), np.flatnonzero(~whole)]))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], whole[kept], [False]]).astype(int)))
@@ -144,7 +144,7 @@ def broken_at_gaps(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np
 def decimated(
     x: np.ndarray, y: np.ndarray, most: int = MAX_POINTS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Keep of a long series the least, the greatest and a missing value of each stretch."""
+    """Thin a long series: keep minimum, maximum and a missing value of each stretch."""
     if len(y) <= most:
         return small(x), small(y)
     width = -(-len(y) // (most // 3))
@@ -153,7 +153,7 @@ def decimated(
     kept = [
         np.argmin(np.where(hole, np.inf, filled), axis=1),
         np.argmax(np.where(hole, -np.inf, filled), axis=1),
-        # Without its hole the stretch would be joined to the next by a line.
+        # Without the missing value, a line would connect the stretch to the next.
         np.argmax(hole, axis=1),
     ]
     start = np.arange(len(filled)) * width
@@ -163,5 +163,5 @@ def decimated(
 
 
 def small(values: np.ndarray) -> np.ndarray:
-    """Give single precision, which no screen outresolves and which halves a page's size."""
+    """Give single precision, which suffices for any screen and halves the size of a page."""
     return values.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Relative errors, by recording and by step."""
+"""Figures of relative errors, by recording and by step."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -37,9 +37,9 @@ def error_bars(
         labels: One for each group of bars, such as joints.
         groups: One for each bar of a group, such as recordings.
         values: Relative error in %, shape `(groups, labels)`.
-        floor: Error in % that noise alone leaves, shape `(labels,)`.
-        x_name: What the labels are.
-        title: Of the whole figure.
+        floor: Error in % due to noise alone, shape `(labels,)`.
+        x_name: Name of what the labels denote.
+        title: Title of the whole figure.
     """
     figure = go.Figure()
     place = np.arange(len(labels), dtype=float)
@@ -71,18 +71,18 @@ def error_falling(
     """Draw the relative error of each joint, step by step.
 
     Arguments:
-        steps: What each step added, the start first.
+        steps: Effect that each step added; the starting model is first.
         series: Relative error in %, shape `(steps, joints)`, by the name of the recordings it was
             taken on: the first is drawn solid (fitted), the next dashed (held out).
-        floor: Error in % that noise alone leaves, shape `(joints,)`; dotted.
+        floor: Error in % due to noise alone, shape `(joints,)`; dotted.
         joint_names: As printed; "joint 1" and so on if absent.
-        title: Of the whole figure.
+        title: Title of the whole figure.
     """
     figure = go.Figure()
     place = np.arange(len(steps), dtype=float)
     joints = max((values.shape[1] for values in series.values()), default=0)
     names = joint_names or [f"joint {joint + 1}" for joint in range(joints)]
-    # A legend of each joint with each kind of recording would be taller than the figure.
+    # A legend entry per joint and kind of recording would make the legend taller than the figure.
     short = joints * (len(series) + 1) > MAX_LEGEND
     for joint, (name, colour, marker) in enumerate(zip(names, cycle(PALETTE), cycle(MARKERS))):
         for (kind, values), dash in zip(series.items(), cycle(DASHES)):

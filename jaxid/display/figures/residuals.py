@@ -1,4 +1,4 @@
-"""Residuals: their autocorrelation, and what they depend on."""
+"""Figures of residuals: autocorrelation, and dependence on a coordinate."""
 
 import numpy as np
 import plotly.graph_objects as go
@@ -17,13 +17,13 @@ def autocorrelation(
     *,
     title: str | None = None,
 ) -> go.Figure:
-    """Draw an autocorrelation with the band in which a white residual's would lie.
+    """Draw an autocorrelation with the band expected for a white residual.
 
     Arguments:
         lags: In samples, shape `(lags,)`.
         acf: Autocorrelation, shape `(lags,)`.
         bound: Two standard deviations of a white residual's autocorrelation.
-        title: Of the whole figure.
+        title: Title of the whole figure.
     """
     figure = go.Figure().set_subplots(rows=1, cols=1)
     add_acf(figure, lags, acf, bound, 1, 1)
@@ -51,18 +51,18 @@ def curve_fit(
     Arguments:
         x: Coordinate in `x_unit`, shape `(samples,)`.
         y: Residual in `y_unit`, shape `(samples,)`; at most 2000 samples are drawn.
-        x_name: What the coordinate is, such as "velocity of joint 2".
+        x_name: Name of the coordinate, such as "velocity of joint 2".
         x_unit: Unit, as printed.
         y_unit: Unit, as printed.
-        curve_x: Where the curve is given, in `x_unit`, ascending, shape `(points,)`.
+        curve_x: Coordinates of the curve, in `x_unit`, ascending, shape `(points,)`.
         curve: Fitted curve in `y_unit`, shape `(points,)`.
         band: Half-width of the confidence band in `y_unit`, shape `(points,)`.
-        y_name: What is drawn upwards.
-        curve_name: What the legend calls the curve.
-        title: Of the whole figure.
+        y_name: Name of the vertical axis.
+        curve_name: Name of the curve in the legend.
+        title: Title of the whole figure.
     """
     figure = go.Figure()
-    # Every k-th sample would beat with a periodic motion; a drawn sample does not.
+    # Every k-th sample would alias with a periodic motion; a random sample does not.
     few = np.sort(np.random.default_rng(0).permutation(len(x))[:MAX_DOTS])
     name = y_name if len(few) == len(x) else f"{y_name} ({len(few)} of {len(x)} samples)"
     dots = {"color": INK, "size": 3.5, "opacity": 0.6}
@@ -87,24 +87,24 @@ def dependence(
     y_name: str = "residual",
     title: str | None = None,
 ) -> go.Figure:
-    """Draw a residual against a coordinate, with its mean in stretches of equal count.
+    """Draw a residual against a coordinate, with its mean in bins of equal count.
 
-    The band is two standard errors either side, as of independent samples.
+    The band is two standard errors on either side, for independent samples.
 
     Arguments:
         x: Coordinate in `x_unit`, shape `(samples,)`.
         y: Residual in `y_unit`, shape `(samples,)`.
-        x_name: What the coordinate is, such as "velocity of joint 2".
+        x_name: Name of the coordinate, such as "velocity of joint 2".
         x_unit: Unit, as printed.
         y_unit: Unit, as printed.
-        y_name: What is drawn upwards.
-        title: Of the whole figure.
+        y_name: Name of the vertical axis.
+        title: Title of the whole figure.
     """
     order = np.array_split(np.argsort(x, kind="stable"), max(2, min(30, len(x) // 20)))
     middle = np.array([np.median(x[k]) for k in order])
     mean = np.array([np.mean(y[k]) for k in order])
     error = np.array([2 * np.std(y[k]) / np.sqrt(len(k)) for k in order])
-    # A coordinate that stands still gives several stretches one place, which a line cannot have.
+    # If the coordinate stands still, several bins share one position; a line needs distinct ones.
     distinct = np.append(True, np.diff(middle) > 0)
     line = middle[distinct], mean[distinct], error[distinct]
     names = {"y_name": y_name, "curve_name": "mean", "title": title}
