@@ -332,6 +332,11 @@ def test_nothing_is_said_of_what_stays_fast(monkeypatch):
     # A joint has one transmission.
     two = [e for e in jaxid.catalogue if not issubclass(e, jaxid.effects.Backlash)]
     fields = [{f.name for f in dataclasses.fields(e)} for e in two]
+    # Effects along a chain are for arms in space.
+    two, fields = (
+        [e for e, f in zip(two, fields, strict=True) if "chain" not in f],
+        [f for f in fields if "chain" not in f],
+    )
     built_in = [e(joint=1) if "joint" in f else e() for e, f in zip(two, fields, strict=True)]
     assert _traced(*built_in) == []
     assert _traced(jaxid.effects.Backlash(joint=1)) == []
