@@ -1,4 +1,4 @@
-"""`discover`: the search, held against recordings that no fit has seen, and its story."""
+"""`discover`: the search, its validation on held-out recordings, and its report."""
 
 import dataclasses
 import itertools
@@ -27,7 +27,7 @@ from .story import Discovery, Step
 from .verdict import Outcome, misfit_of, refuted, risen, undecided
 
 _STOPPED = "it was interrupted before its end; resume=... goes on from saved steps"
-# Weight from which a rival's error on held-out recordings is worth a simulation.
+# Smallest weight of a rival whose error on held-out recordings is simulated.
 _SHOWN = 0.01
 
 
@@ -44,29 +44,32 @@ def discover(
     resume: str | Path | None = None,
     progress: bool = True,
 ) -> Discovery:
-    """Finds what the model lacks: the set of effects of the best score.
+    """Finds the effects that the model lacks: the set of effects with the best score.
 
-    Sets are predicted in the linear system along the fitted runs; the best few are fitted in full;
-    and the system is linearised again at the winner, until nothing predicted is better.
+    Sets are predicted in the system linearised along the fitted runs, and the best few are fitted
+    in full. The system is then linearised again at the best fit. This is repeated until no
+    predicted set is better.
 
     **Arguments:**
 
     - `loop`: the starting model.
-    - `recordings`: to fit. `validate`: held out; they enter no score.
+    - `recordings`: recordings to fit. `validate`: held-out recordings; they enter no score.
     - `catalogue`: as for `diagnose`.
-    - `method`: of the fits.
-    - `significance`: corrected p-value below which a diagnosis says that something is missing.
-    - `worth`: what is worth knowing: an effect must change some joint's torque by this share, %.
-    - `most`: how many effects to add at the most.
-    - `resume`: a folder in which every fit is saved as it ends, and from which the same call
-      goes on; it is made where it is not there.
-    - `progress`: show what is tried and the time left, in a notebook also the error of each model.
+    - `method`: method of the fits.
+    - `significance`: corrected p-value below which a diagnosis reports a missing effect.
+    - `worth`: smallest relevant effect: it must change some joint's torque by this share, %.
+    - `most`: largest number of effects to add.
+    - `resume`: folder in which every fit is saved as it ends, and from which the same call
+      continues; it is created if it does not exist.
+    - `progress`: whether to show the set being tried and the remaining time, and in a notebook
+      also the error of each model.
 
-    Ctrl-C ends the search, once there is a fit, with the best model so far (`interrupted`).
+    Ctrl-C ends the search. If a fit exists by then, the best model so far is returned
+    (`interrupted`).
 
-    **Raises:** `FitError`, `ModelError`, `RecordingError` where model and recordings do not fit;
-    also where they were sampled at different rates; `SaveError` where the folder holds steps of
-    another call.
+    **Raises:** `FitError`, `ModelError`, `RecordingError` if model and recordings do not match;
+    also if the recordings were sampled at different rates; `SaveError` if the folder holds steps
+    of another call.
     """
     started = time.perf_counter()
     judged = loop.controller.judged
@@ -101,7 +104,7 @@ def discover(
 def _told(
     search: Search, verdict: Outcome, unfinished: bool, started: float, interrupted: bool = False
 ) -> Discovery:
-    """What was found, step by step, held against recordings that no fit has seen."""
+    """The result, step by step, with errors on held-out recordings."""
     models = search.visited.weighed(search.at)
     steps = _steps(search, models)
     models = _held_out(search, models, steps)
@@ -125,10 +128,10 @@ def _told(
 
 
 def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step], models: Sequence[Model]) -> str:
-    """Why the verdict cannot be told; empty where it can."""
+    """Why the verdict is undetermined; empty if it is not."""
     first, last = steps[0], steps[-1]
     if verdict == "outside_catalogue":
-        # A curve may explain what a model that explains next to nothing lacks.
+        # A curve may absorb the residual of a model that explains almost nothing.
         blind = last.fit.status is Status.misfit and last.fit.error_percent.min(axis=None) > 99
         return misfit_of(last.fit) if blind else ""
     both = None
@@ -141,7 +144,7 @@ def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step], models: Sequ
 
 
 def _raised(search: Search, steps: Sequence[Step]) -> str:
-    """Whether effects raised the error on held-out recordings, and which; empty if not."""
+    """A sentence on effects that raised the error on held-out recordings; empty if none did."""
     seen = [(s.label, s.held_out) for s in steps if s.held_out is not None]
     noise = search.at.noise
     if len(seen) < 2 or not (reason := risen(seen[0][1], seen[-1][1], noise)):
@@ -153,7 +156,7 @@ def _raised(search: Search, steps: Sequence[Step]) -> str:
 
 
 def _held_out(search: Search, models: Sequence[Model], steps: Sequence[Step]) -> tuple[Model, ...]:
-    """Models with their error on held-out recordings, where they are worth the simulation."""
+    """Models with their error on held-out recordings, simulated if their weight is large enough."""
     known = {id(s.fit): s.held_out for s in steps}
     held_out = search.asked.held_out
     found = []
@@ -167,7 +170,7 @@ def _held_out(search: Search, models: Sequence[Model], steps: Sequence[Step]) ->
 
 
 def _steps(search: Search, weighed: Sequence[Model]) -> list[Step]:
-    """The starting model, and one more effect in each step."""
+    """The starting model, followed by one more effect per step."""
     start = search.visited.fitted(())
     assert start is not None
     models = [start]
@@ -201,7 +204,7 @@ def _steps(search: Search, weighed: Sequence[Model]) -> list[Step]:
 
 
 def _alike(search: Search, model: Model, added: AbstractEffect) -> tuple[Named, ...]:
-    """What could stand in an effect's place, when it was added or in the end."""
+    """Alternatives to an effect, when it was added or in the final model."""
     last = next(e for e in search.at.effects if form(e) == form(added))
     found = (*search.visited.alike(model, added), *search.visited.alike(search.at, last))
     return tuple(dict.fromkeys(n for n in found if n not in search.at.names))

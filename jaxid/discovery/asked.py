@@ -1,4 +1,4 @@
-"""What a discovery was asked."""
+"""The arguments of a discovery."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -14,7 +14,7 @@ from .verify import quiet
 
 
 class Asked(eqx.Module):
-    """What a discovery was asked."""
+    """The arguments of a discovery."""
 
     recordings: Recordings
     held_out: Recordings | None
@@ -25,7 +25,7 @@ class Asked(eqx.Module):
     most: int
 
     def plan(self) -> dict[str, Any]:
-        """What the fits follow from, beside the starting model."""
+        """Everything that determines the fits, except the starting model."""
         return {
             "recordings": self.recordings,
             "validate": self.held_out,
@@ -37,19 +37,19 @@ class Asked(eqx.Module):
         }
 
     def classes(self) -> set[type]:
-        """The classes of effects that the catalogue names; what its functions make is not known."""
+        """Classes of effects in the catalogue; those that its functions create are not known."""
         given = {entry for entry in self.catalogue if isinstance(entry, type)}
         return given.union(*(classes_of(entry) for entry in self.catalogue))
 
 
 def _entry(entry: Any) -> Any:
-    """An entry of a catalogue as a plan names it: classes and functions by their names."""
+    """A catalogue entry as written in a plan: classes and functions by their names."""
     name = getattr(entry, "__qualname__", None)
     return entry if name is None else f"{entry.__module__}.{name}"
 
 
 def check_apart(recordings: Recordings, held_out: Iterable[Recording]) -> None:
-    """Raises `RecordingError` where what is held out was fitted as well, whatever its name."""
+    """Raises `RecordingError` if a held-out recording was also fitted, under any name."""
     for unseen in held_out:
         for fitted in recordings:
             if np.array_equal(unseen.q, fitted.q) and np.array_equal(unseen.tau, fitted.tau):

@@ -1,4 +1,4 @@
-"""Mistakes in the data that a fit which explains little may come from, each tried out."""
+"""Possible mistakes in the data behind a fit that explains little, each tested in turn."""
 
 import dataclasses
 import itertools
@@ -15,12 +15,12 @@ from ..parameters import Bounds
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 
-# Share of the squared error that a mistake must account for to be named, and the error in % that a
-# regression without it must come below: what a model of a robot does not leave.
+# A mistake is named if correcting it reduces the squared error to less than this share, and leaves
+# an error below this, in %; a model of a robot leaves a smaller error.
 _SHARE, _LEAST = 0.25, 33.0
-# Deviations of white noise that a long recording of it spans.
+# Range of a long recording of white noise, in standard deviations.
 _STILL = 12.0
-# Factors between units that are taken for each other.
+# Factors between units that are often confused.
 _FACTORS = {
     "in degrees, not in rad": np.pi / 180,
     "in rad, not in degrees": 180 / np.pi,
@@ -30,10 +30,10 @@ _FACTORS = {
 
 
 def likely_cause(loop: ClosedLoop, recordings: Recordings) -> str:
-    """Which mistake in the data makes a regression explain what it did not; empty where none.
+    """The mistake in the data whose correction improves a regression enough; empty if none.
 
-    Signs, units and the order of joints are tried one at a time, by inverse dynamics along the
-    filtered motion with the parameters inside their bounds.
+    Signs, units and the order of joints are tested one at a time. Each is tested by a regression
+    of the inverse dynamics along the filtered motion, with the parameters inside their bounds.
     """
     for label, span in _still(recordings):
         return f"{label} moves by {span:.2g} only: record motions of all joints"
@@ -55,16 +55,16 @@ def likely_cause(loop: ClosedLoop, recordings: Recordings) -> str:
 
 
 def _still(recordings: Recordings) -> Iterator[tuple[str, float]]:
-    """Joints that show their sensor's noise alone in every recording, and by how much, rad or m."""
+    """Joints that show only sensor noise in every recording, and their range, rad or m."""
     span = np.max([np.ptp(r.q, axis=0) for r in recordings], axis=0)
-    # Third differences of white noise are √20 times as large, and those of a motion next to none.
+    # Third differences of white noise are √20 times as large; those of a motion are almost zero.
     noise = [np.std(np.diff(r.q, 3, axis=0), axis=0) / np.sqrt(20) for r in recordings]
     for j in np.flatnonzero(span <= _STILL * np.max(noise, axis=0)):
         yield f"joint {j + 1}", float(span[j])
 
 
 def _left(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " joints"] | None:
-    """What a bounded regression leaves of each joint's torque, %; None where there is none."""
+    """Relative error of each joint's torque in a bounded regression, %; None if it fails."""
     import scipy
 
     try:
@@ -86,7 +86,7 @@ def _left(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " joint
 
 
 def _mistakes(recordings: Recordings) -> Iterator[tuple[str, Recordings]]:
-    """What may have been done to recordings, and the same with it undone."""
+    """Possible mistakes in recordings, each with the recordings corrected for it."""
     n = recordings[0].joints
     several = [("all joints", np.ones(n))] if n > 1 else []
     chosen = [(f"joint {j + 1}", np.eye(n)[j]) for j in range(n)] + several
@@ -113,7 +113,7 @@ def _mistakes(recordings: Recordings) -> Iterator[tuple[str, Recordings]]:
 
 
 def _changed(recordings: Recordings, q: np.ndarray | float = 1.0, tau: np.ndarray | float = 1.0):
-    """Recordings with positions and torques times factors."""
+    """Recordings with positions and torques multiplied by factors."""
 
     def one(r: Recording) -> Recording:
         ref = None if r.q_ref is None else r.q_ref * q

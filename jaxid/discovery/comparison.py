@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 
 class Comparison(AbstractShown):
-    """Measured beside simulated signals.
+    """Measured and simulated signals.
 
-    - `runs`: the simulated signals, one for each recording.
+    - `runs`: the simulated signals, one entry per recording.
     - `errors`: 100 · ‖measured - simulated‖ / ‖measured‖ by recording, signal and joint.
     """
 
@@ -46,7 +46,7 @@ class Comparison(AbstractShown):
 
     @property
     def signal(self) -> str:
-        """What is judged: torque, or position where what is recorded of it says no more."""
+        """The signal that is compared: torque, or position if the torque adds no information."""
         return self.loop.controller.judged
 
     @property
@@ -61,8 +61,8 @@ class Comparison(AbstractShown):
     def judged(self, recording: int | str = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Time, measured and simulated signal as they are compared, `(samples, joints)`.
 
-        Where the controller is made up, both have passed its low-pass and lost their ends, and are
-        zero where a joint stands still.
+        If the controller is an assumed one, both signals are low-pass filtered and their ends
+        are removed. They are zero while a joint stands still.
 
         **Arguments:**
 
@@ -81,7 +81,7 @@ class Comparison(AbstractShown):
         return record.time[rows], measured, simulated
 
     def shown(self, recording: int | str = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `judged`, for a figure: NaN where a joint stands still and nothing is compared.
+        """As `judged`, for a figure: NaN while a joint stands still and nothing is compared.
 
         **Arguments:**
 
@@ -93,7 +93,7 @@ class Comparison(AbstractShown):
 
     @property
     def residuals(self) -> tuple[Float[np.ndarray, "_samples joints"], ...]:
-        """Measured less simulated as they are compared, one `(samples, joints)` a recording."""
+        """Measured minus simulated signal as compared, one `(samples, joints)` per recording."""
         found = [self.judged(k) for k in range(len(self.recordings))]
         return tuple(measured - simulated for _, measured, simulated in found)
 
@@ -153,13 +153,13 @@ class Comparison(AbstractShown):
         return figures.error_bars(list(table.columns), list(table.index), table.to_numpy())
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Writes the comparison to one file, from which `jaxid.load` gives it back.
+        """Writes the comparison to one file, which `jaxid.load` reads.
 
         **Arguments:**
 
-        - `path`: by convention with the ending `.jaxid`; a file that is there is replaced.
+        - `path`: by convention with the ending `.jaxid`; an existing file is replaced.
 
-        **Raises:** `SaveError` where it cannot be written.
+        **Raises:** `SaveError` if it cannot be written.
         """
         return save(self, path)
 
@@ -189,19 +189,19 @@ def compare(
     *,
     window: float | None = None,
 ) -> Comparison:
-    """Simulates a model along recordings and holds it against what was measured.
+    """Simulates a model along recordings and compares it with the measured signals.
 
-    Recordings that do not start at rest do so at the state from which the model does best, unless
-    the fit trusted the first sample (`OEM(initial="rest")`).
+    The simulation of a recording that does not start at rest starts from the state with the
+    smallest error, unless the fit trusted the first sample (`OEM(initial="rest")`).
 
     **Arguments:**
 
     - `model`: a fit or a loop.
     - `recordings`: used for the fit or not.
-    - `window`: length in s of pieces that each start from the measured state; by default that of
-      the fit, else whole recordings.
+    - `window`: length of pieces that each start from the measured state, s; by default that of
+      the fit, otherwise whole recordings.
 
-    **Raises:** `RecordingError`, `ModelError` where the two do not fit together; `FitError` where
+    **Raises:** `RecordingError`, `ModelError` if model and recordings do not match; `FitError` if
     the loop cannot be simulated.
     """
     loop = model.loop if isinstance(model, Fit) else model
@@ -230,7 +230,7 @@ def _simulate_in_windows(
         return by_recording(simulate_batch(loop, batch), recordings)
     runs = []
     for recording in recordings:
-        # Windows keep their recording's name, which effects of named recordings go by.
+        # Windows keep the recording's name, since effects of named recordings depend on it.
         pieces = pieces_of(Recordings.of(recording), window)
         stepped = with_substeps(loop, Recordings.of(recording))
         parts = by_recording(simulate_batch(stepped, prepare(stepped, pieces)), pieces)
@@ -247,7 +247,7 @@ def _simulate_in_windows(
 
 
 def _padded(run: Simulated, recording: Recording) -> Simulated:
-    """The last few samples, too few for a window, are left as measured."""
+    """Appends the last samples, too few for a window, as measured."""
     missing = recording.samples - len(run.time)
     if missing == 0:
         return run
@@ -272,7 +272,7 @@ def _errors(
     tables["position"] = relative_errors(
         recordings, position, [r.q - np.asarray(run.q) for r, run in pairs]
     )
-    # A velocity that was not measured is derived from position without delay, at every sample.
+    # If velocity was not measured, it is derived from position without delay, at every sample.
     velocity = [
         filtered(r, Filtering(cutoff=r.rate / 10, rate=r.rate, trim=0.0)).v if r.v is None else r.v
         for r in recordings

@@ -1,4 +1,4 @@
-"""What a diagnosis knows: where a fitted model fails, and which effects may be missing."""
+"""The result of a diagnosis: where a fitted model fails, and which effects may be missing."""
 
 import dataclasses
 import html
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 
 class Verdict(eqx.Module):
-    """What one hypothesis, at its best setting, explains.
+    """How much one hypothesis, at its best setting, explains.
 
-    `evidence` is the whitened squared error it takes away, less log(samples) for each amplitude
-    (twice the logarithm of odds, as BIC has it); `p_value` is corrected for all that was asked.
+    `evidence` is the reduction of the whitened squared error, minus log(samples) for each amplitude
+    (twice the logarithm of the odds, as in BIC); `p_value` is corrected for all tests.
     """
 
     hypothesis: Hypothesis
@@ -46,11 +46,11 @@ class Verdict(eqx.Module):
 
     @property
     def key(self) -> tuple[str, int | None]:
-        """Effect and joint."""
+        """Name of the effect and its joint."""
         return self.hypothesis.name, self.hypothesis.joint
 
 
-# Curves of which a story keeps what a fit of them needs.
+# Number of curves whose data a saved discovery keeps for fitting.
 _CURVES = 6
 
 
@@ -58,13 +58,13 @@ class Diagnosis(AbstractShown):
     """Where a fitted model fails and which effects may be missing, ranked.
 
     - `ranking`: the catalogue's entries, each at its best setting, best first.
-    - `forms`: the same for every form of an effect (class) on its own.
-    - `where`: free-form curves of every coordinate, best first.
-    - `pair`: two entries that together explain more than the best curve, where none does alone.
+    - `forms`: the same for each form of an effect (class) separately.
+    - `where`: free-form curves over every coordinate, best first.
+    - `pair`: two entries that together explain more than the best curve, if no single one does.
     - `noise`: the noise filter of each output.
     - `floor`: relative error that a model with every effect and curve that matters leaves, %.
-    - `measured`: the noise floor from the recordings alone, as far as they tell it.
-    - `unexplained`: by how much that model's score is better than that of the fit.
+    - `measured`: the noise floor from the recordings alone, where they determine it.
+    - `unexplained`: improvement of the score of the model of `floor` over that of the fit.
     """
 
     fit: Fit | Comparison
@@ -87,7 +87,7 @@ class Diagnosis(AbstractShown):
     def best(self) -> AbstractEffect:
         """The leading effect of the catalogue at its predicted amplitude, ready to be added.
 
-        **Raises:** `FitError` where nothing of the catalogue can be added.
+        **Raises:** `FitError` if no effect of the catalogue can be added.
         """
         for verdict in self.ranking:
             if verdict.possible:
@@ -98,13 +98,13 @@ class Diagnosis(AbstractShown):
 
     @property
     def adequate(self) -> bool:
-        """Whether nothing significant is left, neither for the catalogue nor for a curve."""
+        """Whether no effect of the catalogue and no curve is significant."""
         return all(v.p_value > self.significance for v in (*self.ranking, *self.where))
 
     def light(self) -> "Diagnosis":
-        """The same with the signatures of the ranking alone: all of them are large.
+        """The same with only the signatures of the ranking, to save memory.
 
-        Of curves the products of the first few are kept, which are those that are drawn.
+        For curves, only the products of the first few are kept, since only these are drawn.
         """
         ranked = sorted({c for v in self.ranking for c in v.hypothesis.columns})
         told = (*self.ranking, *self.forms, *self.pair, *self.where[:_CURVES])
@@ -121,7 +121,7 @@ class Diagnosis(AbstractShown):
         return write_values(effect, linear, jnp.asarray(values))
 
     def amplitude(self, verdict: Verdict) -> tuple[np.ndarray, np.ndarray]:
-        """Predicted amplitudes and their deviations, in the units of the effect's parameters."""
+        """Predicted amplitudes and standard deviations, in the units of the effect's parameters."""
         values, covariance = self.gram.amplitude(verdict.hypothesis.columns)
         return values, np.sqrt(np.diag(covariance))
 
@@ -132,13 +132,13 @@ class Diagnosis(AbstractShown):
         return over_recordings(self.fit.error_percent.to_numpy() * share)
 
     def correlation(self, one: Verdict, other: Verdict) -> float:
-        """Largest correlation of two effects' signatures, what the model absorbs taken off."""
+        """Largest correlation of two effects' signatures, without what the model absorbs."""
         return self.gram.correlation(one.hypothesis.columns, other.hypothesis.columns)
 
     def alike(self, verdict: Verdict, within: float = 10.0) -> tuple[Verdict, ...]:
-        """Effects that these recordings can hardly tell apart from one.
+        """Effects that these recordings can hardly distinguish from the given one.
 
-        Their evidence is within `within` of its own, and their signatures correlate above 0.9.
+        Their evidence is at most `within` below its own, and the signatures correlate above 0.9.
         """
         return tuple(
             other
@@ -149,7 +149,7 @@ class Diagnosis(AbstractShown):
         )
 
     def table(self) -> "pd.DataFrame":
-        """The ranking: what each explains, corrected p-value, amplitude, predicted error."""
+        """The ranking: explained share, corrected p-value, amplitude and predicted error."""
         import pandas as pd
 
         rows = []
@@ -186,7 +186,7 @@ class Diagnosis(AbstractShown):
         return pd.DataFrame(rows)
 
     def where_table(self) -> "pd.DataFrame":
-        """Where the model fails: on which coordinate which joint's torque depends, best first."""
+        """Where the model fails: joints and the coordinates their residual depends on, best first."""
         import pandas as pd
 
         total = self.gram.rest
@@ -204,7 +204,7 @@ class Diagnosis(AbstractShown):
         )
 
     def plot(self) -> "go.Figure":
-        """The leading entries of the ranking by what they explain."""
+        """Bars of the share that the leading entries of the ranking explain."""
         from ..display import figures
 
         top = self.ranking[:12]
@@ -215,12 +215,12 @@ class Diagnosis(AbstractShown):
         )
 
     def plot_shares(self, recording: int = 0, joint: int = 1, contenders: int = 4) -> "go.Figure":
-        """What each contender explains of one joint's residual in time, the model refitted to it.
+        """The part of one joint's residual over time that each contender explains after a refit.
 
         **Arguments:**
 
-        - `recording`: number from 0; of the piece, where the fit was in windows.
-        - `joint`: counted from 1. `contenders`: how many.
+        - `recording`: number from 0; the number of the piece if the fit was in windows.
+        - `joint`: counted from 1. `contenders`: how many to draw.
         """
         from ..display import figures
 
@@ -237,11 +237,11 @@ class Diagnosis(AbstractShown):
     def plot_where(self, place: int = 0) -> "go.Figure":
         """The residual of all recordings against a coordinate on which it depends, and its mean.
 
-        Where it depends on the direction of motion as well, it is drawn times the sign of velocity.
+        If it also depends on the direction of motion, it is multiplied by the sign of velocity.
 
         **Arguments:**
 
-        - `place`: in `where`, 0 for the strongest.
+        - `place`: index in `where`; 0 is the strongest.
         """
         from ..display import figures
 
@@ -296,7 +296,7 @@ class Diagnosis(AbstractShown):
         }
 
     def depends_on(self) -> list[dict[str, Any]]:
-        """Coordinates on which a significant part of the residual depends, best first."""
+        """Coordinates that explain a significant part of the residual, best first."""
         return [
             {
                 "coordinate": v.hypothesis.effect.label,  # type: ignore[attr-defined]
@@ -310,7 +310,7 @@ class Diagnosis(AbstractShown):
     def floor_percent(self) -> Float[np.ndarray, " joints"]:
         """Relative error that a perfect model would leave on the fitted recordings, %.
 
-        By what the recordings alone tell of their noise where they do, else by a model with every
+        Estimated from the recordings alone where they determine it, otherwise by a model with every
         effect and curve that matters.
         """
         if self.measured is None:
@@ -320,7 +320,7 @@ class Diagnosis(AbstractShown):
         )
 
     def floor_sources(self) -> tuple[tuple[str, ...], ...]:
-        """By joint, where the noise floor is from: ways to measure it, or "rich model"."""
+        """Sources of the noise floor by joint: measurement methods, or "rich model"."""
         if self.measured is None:
             return (("rich model",),) * self.floor.shape[1]
         return tuple(
@@ -348,7 +348,7 @@ def _label(verdict: Verdict) -> str:
 
 
 def coordinate_unit(curve: Curve, torque: Sequence[str], position: Sequence[str]) -> str:
-    """The unit of a curve's coordinate, given those of each joint's torque and position."""
+    """The unit of a curve's coordinate, from the units of each joint's torque and position."""
     if curve.coordinate == "t":
         return "s"
     if curve.coordinate == "tau":
@@ -359,7 +359,7 @@ def coordinate_unit(curve: Curve, torque: Sequence[str], position: Sequence[str]
 def share_left(
     fit: Fit | Comparison, data: Data, rest: np.ndarray
 ) -> Float[np.ndarray, "recordings joints"]:
-    """What is left of a fit's error; of all its recordings together where data are windows."""
+    """Remaining share of a fit's error; over all recordings together if data are windows."""
     over = 1 if len(data.residual) == len(fit.residuals) else (0, 1)
     share = np.sqrt(np.sum(rest**2, axis=over) / np.sum(data.residual**2, axis=over))
     return np.broadcast_to(share, (len(fit.residuals), data.residual.shape[2]))
@@ -368,5 +368,5 @@ def share_left(
 def over_recordings(
     percent: Float[np.ndarray, "recordings joints"],
 ) -> Float[np.ndarray, " joints"]:
-    """Relative errors of several recordings in one for each joint: their quadratic mean, %."""
+    """Root mean square of the relative errors of several recordings, one per joint, %."""
     return np.sqrt(np.mean(percent**2, axis=0))

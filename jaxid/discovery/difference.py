@@ -1,4 +1,4 @@
-"""Two models beside each other on the same recordings: which is better, and how surely."""
+"""Comparison of two models on the same recordings: which is better, and how certainly."""
 
 import dataclasses
 import html
@@ -31,12 +31,12 @@ Rows = Sequence[Float[np.ndarray, "_samples joints"]]
 Model = Fit | ClosedLoop
 Given = Recording | Recordings | Iterable[Recording]
 
-# Deviations of a 95 % interval of a normal distribution.
+# Half width of a 95 % interval of a normal distribution, in standard deviations.
 _WIDE = 1.96
 
 
 class Change(eqx.Module):
-    """A difference with its standard deviation under noise drawn anew."""
+    """A difference with its standard deviation over redrawn noise."""
 
     value: float
     std: float
@@ -48,20 +48,20 @@ class Change(eqx.Module):
 
     @property
     def sure(self) -> bool:
-        """Whether the 95 % interval leaves out zero."""
+        """Whether the 95 % interval excludes zero."""
         return abs(self.value) > _WIDE * self.std
 
 
 class ModelDifference(AbstractShown):
-    """A model less another one on the same recordings; a negative difference favours the first.
+    """First model minus second on the same recordings; a negative difference favours the first.
 
-    Intervals are for noise drawn anew on the same motions, with the values of both models as they
-    are. The noise is that of the model that leaves less. What a model misses on other motions they
-    do not cover.
+    The intervals are for redrawn noise on the same motions, with the parameter values of both
+    models unchanged. The noise is that of the model with the smaller residual. The intervals do
+    not cover model errors on other motions.
 
-    - `names`: of the two models.
+    - `names`: names of the two models.
     - `first`, `second`: their comparisons with the recordings.
-    - `score`: difference of S on the recordings that both were fitted to; None where these differ.
+    - `score`: difference of S on the recordings that both were fitted to; None if these differ.
     - `errors`: difference of the relative error by joint, %.
     """
 
@@ -140,21 +140,22 @@ def compare_models(
     *,
     window: float | None = None,
 ) -> ModelDifference:
-    """Holds two models against the same recordings: which is better, and how surely.
+    """Compares two models on the same recordings: which is better, and how certainly.
 
-    Noise is drawn anew from an autoregressive filter of what the better model leaves, both models
-    are held against each draw with their values as they are, and the deviation of the differences
-    gives the intervals. A difference of S is there for two fits of the same recordings.
+    Noise is redrawn from an autoregressive filter of the better model's residual. Both models are
+    compared with each draw, with their parameter values unchanged. The standard deviation of the
+    differences gives the intervals. A difference of S is available for two fits of the same
+    recordings.
 
     **Arguments:**
 
     - `first`, `second`: fits or loops.
-    - `recordings`: to compare errors on, best such that no fit has seen; by default those that
-      both were fitted to.
+    - `recordings`: recordings on which errors are compared, preferably held-out ones; by default
+      those that both were fitted to.
     - `window`: as for `compare`.
 
-    **Raises:** `RecordingError` where there are no recordings to compare on; `ModelError` where the
-    two do not predict the same signal; `FitError` where a loop cannot be simulated.
+    **Raises:** `RecordingError` if there are no recordings to compare on; `ModelError` if the two
+    models do not predict the same signal; `FitError` if a loop cannot be simulated.
     """
     shared = _shared(first, second)
     if recordings is None:
@@ -177,7 +178,7 @@ def compare_models(
 
 
 def _shared(first: Model, second: Model) -> tuple[Fit, Fit] | None:
-    """The two as fits of the same recordings; None where they are not."""
+    """The two models as fits of the same recordings; None if they are not."""
     if not (isinstance(first, Fit) and isinstance(second, Fit)):
         return None
     pairs = list(zip(first.recordings, second.recordings, strict=False))
@@ -193,7 +194,7 @@ def _sizes(rows: Rows) -> list[tuple[int, ...]]:
 
 
 def _names(one: ClosedLoop, other: ClosedLoop) -> tuple[str, str]:
-    """What to call two models: by the effects that the other does not have."""
+    """Names of two models, by the effects that the other model does not have."""
     had = [Counter(form(e) for e in loop.effects) for loop in (one, other)]
     more = [had[0] - had[1], had[1] - had[0]]
     said = [
@@ -218,7 +219,7 @@ def _score_change(first: Fit, second: Fit) -> Change:
 
 def _error_changes(one: Comparison, other: Comparison) -> tuple[Change, ...]:
     left = [np.stack([np.linalg.norm(r, axis=0) for r in x.residuals]) for x in (one, other)]
-    # Of the model that leaves more, since what is left nowhere tells no scale.
+    # Taken from the model with the larger residual, since a zero residual gives no scale.
     larger = one if left[0].sum() > left[1].sum() else other
     scale = larger.error_percent.to_numpy() / np.maximum(left[larger is other], 1e-300)
 
@@ -236,22 +237,22 @@ def changes(
     draws: int = 200,
     seed: int = 0,
 ) -> tuple[Change, ...]:
-    """Values of a statistic of two models' residuals, and their deviations under other noise.
+    """Values of a statistic of two models' residuals, and standard deviations for redrawn noise.
 
-    What the two leave differs by what they predict, whatever the noise was; so noise that is drawn
-    anew stands in both.
+    The two residuals differ by the difference of the predictions, which is independent of the
+    noise. The same redrawn noise is therefore used in both.
 
     **Arguments:**
 
     - `rows`: residuals of both models on the same recordings, in the unit of the signal.
-    - `statistic`: from such residuals to its values.
-    - `draws`: how many. `seed`: of the noise.
+    - `statistic`: function of such residuals that returns its values.
+    - `draws`: number of noise draws. `seed`: seed of the noise.
     """
     power = [sum(float(np.sum(r**2)) for r in part) for part in rows]
     better = int(power[1] < power[0])
     near = rows[better]
     apart = [b - a for a, b in zip(near, rows[1 - better], strict=True)]
-    # Rows at which a joint stands still are zero, and stay so.
+    # Rows at which a joint stands still are zero and must remain zero.
     there = [(a != 0) | (b != 0) for a, b in zip(*rows, strict=True)]
     noise = noise_filters(near)
     strengths = levels([innovations(r, noise) for r in near])
