@@ -186,7 +186,7 @@ class Diagnosis(AbstractShown):
         return pd.DataFrame(rows)
 
     def where_table(self) -> "pd.DataFrame":
-        """Where the model fails: joints and the coordinates their residual depends on, best first."""
+        """Where the model fails: joint and coordinate of its residual, best first."""
         import pandas as pd
 
         total = self.gram.rest
