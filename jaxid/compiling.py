@@ -2,6 +2,7 @@
 
 import functools
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -9,6 +10,7 @@ from typing import Any, ParamSpec, TypeVar
 import equinox as eqx
 import jax
 import jax.extend.backend
+import numpy as np
 
 # JAX has no public function for either question. If a later version has moved these functions, the
 # flag is set as if no backend ran. If one does run, the flag has no effect, and XLA's own level
@@ -71,11 +73,41 @@ def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result
         given: dict[str, Any] = {"compiler_options": options} if options else {}
         return eqx.filter_jit(fun, **given)
 
+    once = _Once()
+
     @functools.wraps(fun)
     def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        return jitted(_nothing_is_traced())(*args, **kwargs)
+        run = functools.partial(jitted(_nothing_is_traced()), *args, **kwargs)
+        if threading.current_thread() is threading.main_thread():
+            return run()
+        return once.first_alone(run, (args, kwargs))
 
     return call
+
+
+class _Once:
+    """Keeps threads that need the same program from each compiling it."""
+
+    def __init__(self) -> None:
+        self._locks: dict[Any, threading.Lock] = {}
+        self._done: set[Any] = set()
+
+    def first_alone(self, run: Callable[[], _Result], arguments: Any) -> _Result:
+        """Runs; of calls with arguments of one structure, the first runs before the others."""
+        leaves, structure = jax.tree.flatten(arguments)
+        key = (
+            structure,
+            tuple(
+                (np.shape(x), x.dtype) if eqx.is_array(x) or isinstance(x, np.ndarray) else x
+                for x in leaves
+            ),
+        )
+        if key in self._done:
+            return run()
+        with self._locks.setdefault(key, threading.Lock()):
+            result = run()
+        self._done.add(key)
+        return result
 
 
 @functools.cache

@@ -28,8 +28,13 @@ else:
 def as_float64(value: Any) -> Any:
     """A number or a sequence as a float64 array: the converter of fields that are not static."""
     # Equinox runs converters while tree operations hold placeholders in the fields.
-    if isinstance(value, (int, float, complex, list, tuple)) or hasattr(value, "__array__"):
+    if isinstance(value, jax.Array):
         return jnp.asarray(value, dtype=jnp.float64)
+    if isinstance(value, (int, float, complex, list, tuple)) or hasattr(value, "__array__"):
+        if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value)):
+            return jnp.asarray(value, dtype=jnp.float64)
+        # JAX compiles a program for each shape that it converts.
+        return jax.device_put(np.asarray(value, np.float64))
     return value
 
 
@@ -183,12 +188,17 @@ def read_values(model: Any, parameters: Sequence[Parameter]) -> Vector:
     - `model`: what `list_parameters` was called on.
     - `parameters`: which, and in which order.
     """
-    if not parameters:
-        return jnp.zeros(0)
-    return jnp.concatenate([jnp.ravel(p.where(model)) for p in parameters])
+    values = [p.where(model) for p in parameters]
+    if any(isinstance(x, jax.core.Tracer) for x in values):
+        return jnp.concatenate([jnp.ravel(x) for x in values])
+    return jax.device_put(np.concatenate([np.zeros(0), *map(np.ravel, values)]))
 
 
-def write_values(model: Any, parameters: Sequence[Parameter], values: Vector) -> Any:
+def write_values(
+    model: Any,
+    parameters: Sequence[Parameter],
+    values: Float[Array | np.ndarray, " parameters"],
+) -> Any:
     """The model with other values for some of its parameters.
 
     **Arguments:**
@@ -199,11 +209,13 @@ def write_values(model: Any, parameters: Sequence[Parameter], values: Vector) ->
     """
     if not parameters:
         return model
+    traced = isinstance(values, jax.core.Tracer)
     pieces, start = [], 0
     for p in parameters:
-        piece = values[start : start + p.size]
+        piece = (values if traced else np.asarray(values))[start : start + p.size]
         pieces.append(piece.reshape(jnp.shape(p.where(model))))
         start += p.size
+    pieces = pieces if traced else jax.device_put(pieces)
     return eqx.tree_at(lambda tree: [p.where(tree) for p in parameters], model, pieces)
 
 
@@ -265,8 +277,7 @@ class Bounds(eqx.Module):
         """The bounds that the parameters declare."""
 
         def gather(pick: Callable[[Declaration], float]) -> Vector:
-            values = [pick(p.declaration) for p in parameters for _ in range(p.size)]
-            return jnp.asarray(values, dtype=jnp.float64)
+            return as_float64([pick(p.declaration) for p in parameters for _ in range(p.size)])
 
         return cls(gather(lambda d: d.lower), gather(lambda d: d.upper), gather(lambda d: d.scale))
 
@@ -291,7 +302,7 @@ class Bounds(eqx.Module):
         one_sided = _inverse_squareplus((values - base) / self.scale)
         from_above = -_inverse_squareplus((top - values) / self.scale)
         width = jnp.where(low & high, top - base, 1.0)
-        share = jnp.clip((values - base) / width, 1e-6, 1 - 1e-6)
+        share = jnp.clip((values - base) / width, _SHARE, 1 - _SHARE)
         both = jnp.log(share) - jnp.log1p(-share)
         free = values / self.scale
         return jnp.where(
@@ -303,12 +314,19 @@ class Bounds(eqx.Module):
 
         Values inside stay, however close to a bound: all values of a small robot are close to zero.
         """
-        within = (values > self.lower) & (values < self.upper)
-        return jnp.where(within, values, self.inside(self.outside(values)))
+        traced = isinstance(values, jax.core.Tracer)
+        xp = jnp if traced else np
+        x, low, high, scale = map(xp.asarray, (values, self.lower, self.upper, self.scale))
+        # As far inside as `outside` moves them.
+        between = xp.isfinite(low) & xp.isfinite(high)
+        room = xp.where(between, _SHARE * (high - low), _CORNER * scale)
+        moved = xp.where((x > low) & (x < high), x, xp.clip(x, low + room, high - room))
+        return moved if traced else jax.device_put(moved)
 
 
-# Rounding of the corner at a bound, in units of the parameter's scale.
-_CORNER = 1e-3
+# Rounding of the corner at a bound, in units of the parameter's scale; between two bounds the
+# share of their distance that values keep from them.
+_CORNER, _SHARE = 1e-3, 1e-6
 
 
 def _squareplus(z: Vector) -> Vector:

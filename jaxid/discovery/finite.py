@@ -1,5 +1,6 @@
 """What has no derivative at nothing: effects at a finite size, each in a simulation of its own."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,11 +18,12 @@ from ..simulation.dynamics import imposed
 from ..simulation.integration import initial
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import each, run
-from ..simulation.sharing import at_once, cores
+from ..simulation.sharing import at_once, one_by_one
 from ..simulation.steps import with_rolled_stages
 
-# Settings of one call: of more, the threads would wait for the last.
-_AT_ONCE = 16
+# Settings of one call, as many as a processor takes in one instruction. It is the same for
+# screening and for predictions, so that both use one program.
+_AT_ONCE = 4
 
 
 class OneOf(AbstractTransmission):
@@ -97,13 +99,17 @@ def _simulated(
         groups.append((places, [(effects[k],) for k in places]))
     jobs = []
     for places, settings in groups:
-        size = -(-len(places) // (cores() * -(-len(places) // (_AT_ONCE * cores()))))
-        for first in range(0, len(places), size):
+        for first in range(0, len(places), _AT_ONCE):
             # The last call repeats its last setting, for the program of the others.
-            rows = np.minimum(np.arange(first, first + size), len(places) - 1)
-            stacked = jax.tree.map(lambda *x: jnp.stack(x), *(settings[k] for k in rows))
+            rows = np.minimum(np.arange(first, first + _AT_ONCE), len(places) - 1)
+            stacked = jax.tree.map(lambda *x: np.stack(x), *(settings[k] for k in rows))
             jobs.append(([places[k] for k in rows], stacked))
-    runs = at_once(lambda job: np.asarray(_with_effects(loop, job[1], batch, row)), jobs)
+    batch = dataclasses.replace(batch, band=None)
+
+    def with_them(job):
+        return one_by_one(lambda one: _with_effects(loop, job[1], one, row), batch)
+
+    runs = [np.moveaxis(np.asarray(x), 0, 1) for x in at_once(with_them, jobs)]
     found: dict[int, np.ndarray] = {}
     for (places, _), several in zip(jobs, runs, strict=True):
         found |= dict(zip(places, several, strict=True))
@@ -155,7 +161,7 @@ def by_structure(effects: Sequence[eqx.Module]) -> list[list[int]]:
 @compiled
 def _with_effects(
     loop: ClosedLoop, stacked: tuple[AbstractEffect, ...], batch: Batch, row: int
-) -> Float[Array, "settings recordings points joints"]:
+) -> Float[Array, "recordings settings points joints"]:
     """One signal of simulations with some effects, at all their settings."""
     loop = with_rolled_stages(loop)
 
@@ -166,4 +172,4 @@ def _with_effects(
     def setting(effects):
         return each(lambda i, q, v: one(effects, i, q, v), batch.intervals, batch.q0, batch.v0)
 
-    return eqx.filter_vmap(setting, in_axes=eqx.if_array(0))(stacked)
+    return eqx.filter_vmap(setting, in_axes=eqx.if_array(0), out_axes=1)(stacked)

@@ -7,7 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
+from ..arms import AbstractArm
+from ..compiling import compiled
 from ..effects import AbstractEffect, Coulomb, Curve, Motion, Scene, check_declared
 from ..effects import catalogue as known
 from ..effects.curve import curve_over
@@ -74,7 +77,9 @@ def survey(
     q = np.asarray(motion.q).reshape(-1, loop.joints)
     low, high = q.min(axis=0), q.max(axis=0)
     speed = np.abs(np.asarray(motion.v)).reshape(-1, loop.joints).max(axis=0)
-    mass = np.asarray(jax.vmap(loop.arm.mass_matrix)(jnp.asarray(q[:: max(1, len(q) // 64)])))
+    # Always so many positions, for one program.
+    chosen = np.linspace(0, len(q) - 1, _POSITIONS).astype(int)
+    mass = np.asarray(_mass_matrices(loop.arm, q[chosen]))
     # Rotors are effects: without them drawn bodies may leave a wrist next to none.
     mass = mass + 1e-6 * np.trace(mass, axis1=1, axis2=2)[:, None, None] * np.eye(loop.joints)
     smoothed = {e.joint: float(e.smoothing) for e in loop.effects if isinstance(e, Coulomb)}
@@ -99,6 +104,17 @@ def survey(
         loop.arm.in_space(),
         not any(p.place[0] == "arm" for p in loop.free_parameters),
     )
+
+
+# Positions at which inertia is averaged.
+_POSITIONS = 64
+
+
+@compiled
+def _mass_matrices(
+    arm: AbstractArm, q: Float[Array, "positions joints"]
+) -> Float[Array, "positions joints joints"]:
+    return jax.vmap(arm.mass_matrix)(q)
 
 
 def curves(scene: Scene, motion: Motion, knots: int = 12) -> list[Curve]:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -144,4 +143,4 @@ def _sized(effect: AbstractEffect, amplitude: Float[np.ndarray, " columns"]) -> 
     linear = amplitudes(effect)
     if not linear:
         return effect.scaled(float(np.clip(amplitude[0], 0.05, 20.0)))
-    return write_values(effect, linear, jnp.asarray(amplitude))
+    return write_values(effect, linear, amplitude)

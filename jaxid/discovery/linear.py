@@ -15,7 +15,8 @@ from ..simulation.batch import Batch, Interval
 from ..simulation.dynamics import link_load, unflatten
 from ..simulation.integration import SIGNALS, initial
 from ..simulation.loop import ClosedLoop
-from ..simulation.runs import advance, each, run
+from ..simulation.runs import advance, at_points, each, run
+from ..simulation.sharing import one_by_one
 from ..simulation.steps import with_forward_mode, with_rolled_stages
 
 Place = Literal["push", "noise", "rate", "pull"]
@@ -41,7 +42,6 @@ class Linearised(eqx.Module):
     places: tuple[Place, ...] = eqx.field(static=True)
 
 
-@compiled
 def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     """Runs the loop and linearises every interval.
 
@@ -49,6 +49,12 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
 
     - `output`: which of `SIGNALS` is compared.
     """
+    batch = dataclasses.replace(batch, band=None)
+    return one_by_one(lambda one: _linearised(loop, one, output), batch)
+
+
+@compiled
+def _linearised(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     loop = with_forward_mode(with_rolled_stages(loop))
     n, theta, row = loop.joints, loop.theta, SIGNALS.index(output)
     p = theta.shape[0]
@@ -72,7 +78,7 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     def whole(intervals: Interval, q0, v0):
         x0 = initial(loop, intervals, q0, v0)
         states, seen, _ = run(loop, intervals, x0)
-        a, b, c, d = jax.vmap(at)(intervals, states)
+        a, b, c, d = at_points(loop, at, intervals, states)
         start = jax.jacfwd(lambda z: initial(loop, intervals, z[:n], z[n:]))(
             jnp.concatenate([q0, v0])
         )
@@ -95,7 +101,6 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     return Linearised(*each(whole, batch.intervals, batch.q0, batch.v0), places=places)
 
 
-@compiled
 def base_columns(
     linear: Linearised, parameters: int, free_start: bool
 ) -> Float[Array, "recordings points outputs columns"]:
@@ -103,6 +108,13 @@ def base_columns(
 
     Initial states have one set of columns, to be taken for each recording on its own.
     """
+    return one_by_one(lambda one: _base_columns(one, parameters, free_start), linear)
+
+
+@compiled
+def _base_columns(
+    linear: Linearised, parameters: int, free_start: bool
+) -> Float[Array, "recordings points outputs columns"]:
 
     def one(a, b, c, d, start):
         first = jnp.zeros((a.shape[-1], parameters))
@@ -121,11 +133,10 @@ def base_columns(
     return each(one, linear.A, linear.B, linear.C, linear.D, linear.start)
 
 
-@compiled
 def respond(
     linear: Linearised,
     place: Place,
-    values: Float[Array, "recordings points joints columns"],
+    values: Float[Array | np.ndarray, "recordings points joints columns"],
 ) -> Float[Array, "recordings points outputs columns"]:
     """What inputs given at the points do to the output through the loop; linear in between.
 
@@ -134,7 +145,15 @@ def respond(
     - `place`: one of `linear.places`.
     - `values`: one column a hypothesis: N·m or N; rad or m; rad/s or m/s.
     """
+    return one_by_one(lambda one: _response(one[0], place, one[1]), (linear, values))
 
+
+@compiled
+def _response(
+    linear: Linearised,
+    place: Place,
+    values: Float[Array, "recordings points joints columns"],
+) -> Float[Array, "recordings points outputs columns"]:
     joints, last = values.shape[2], linear.B.shape[-1]
     first = last - 2 * joints * (len(linear.places) - linear.places.index(place))
     inputs = slice(first, first + 2 * joints)

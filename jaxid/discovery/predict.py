@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -186,8 +186,8 @@ class Predictor(eqx.Module):
         blocks = []
         for at in range(0, count, _WIDTH):
             some = columns[..., at : at + _WIDTH]
-            wide = jnp.pad(some, [(0, 0)] * (some.ndim - 1) + [(0, _WIDTH - some.shape[-1])])
-            blocks.append(np.asarray(respond(self.system.linear, place, wide)))
+            wide = np.pad(some, [(0, 0)] * (some.ndim - 1) + [(0, _WIDTH - some.shape[-1])])
+            blocks.append(respond(self.system.linear, place, jax.device_put(wide)))
         return at_samples(self.system.batch, np.concatenate(blocks, axis=-1)[..., :count])
 
     def _by_simulation(self, effect: AbstractEffect) -> np.ndarray:
@@ -195,7 +195,7 @@ class Predictor(eqx.Module):
         values = np.asarray(read_values(effect, free))
         scale = np.array([p.declaration.scale for p in free])
         by = _MOVED * np.maximum(np.abs(values), 1e-3 * scale)
-        moved = [write_values(effect, free, jnp.asarray(values + d)) for d in np.diag(by)]
+        moved = [write_values(effect, free, values + d) for d in np.diag(by)]
         system = self.system
         nominal = system.linear.seen[:, :, system.row]
         first, *others = differences(
@@ -277,6 +277,6 @@ def _with_values(
     for effect in effects:
         free = free_of(effect)
         count = sum(p.size for p in free)
-        made.append(write_values(effect, free, jnp.asarray(values[at : at + count])))
+        made.append(write_values(effect, free, values[at : at + count]))
         at += count
     return tuple(made)

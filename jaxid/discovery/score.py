@@ -123,7 +123,7 @@ def whitened(
 
 
 def _through(
-    taps: Float[np.ndarray, " taps"], x: Float[np.ndarray, "samples columns"], size: int = 128
+    taps: Float[np.ndarray, " taps"], x: Float[np.ndarray, "samples columns"]
 ) -> Float[np.ndarray, "samples columns"]:
     """Moving average along the samples, as products with one banded matrix; zero before the first.
 
@@ -131,7 +131,11 @@ def _through(
     """
     import scipy
 
-    reach = len(taps) - 1
+    reach = int(np.flatnonzero(taps).max(initial=0))
+    if reach == 0:
+        return taps[0] * x
+    # Of a band as wide as it is high half is zeros; a lower one would be too many products.
+    size, taps = max(32, reach), taps[: reach + 1]
     row = np.concatenate([taps[::-1], np.zeros(size - 1, taps.dtype)])
     band = scipy.linalg.toeplitz(np.concatenate([taps[-1:], np.zeros(size - 1, taps.dtype)]), row)
     out = np.empty_like(x)

@@ -1,8 +1,10 @@
 """Every effect of the catalogue held against the residual of one fit, without a refit."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -76,6 +78,39 @@ def screen(fit: Fit | Comparison, catalogue: Sequence[Any], say: Callable[[str],
     )
     say(f"scoring {len(hypotheses)} hypotheses")
     return Screened(system, tuple(hypotheses), data, scene)
+
+
+# Share of the residual's power by which the linear system may err for its signatures to be used
+# at values that are close to those at which it was linearised.
+_ERRS = 1e-4
+
+
+def carried(screened: Screened, before: Fit, after: Fit) -> Screened | None:
+    """What was screened at one fit, for a later fit of the same loop that is close to it.
+
+    None if the linear system does not predict what the later fit leaves.
+
+    **Arguments:**
+
+    - `before`: the fit that was screened. `after`: with other values of the same parameters.
+    """
+    mask, count = screened.data.mask, len(after.names)
+    sizes = [len(r) for r in after.residuals]
+    if before.names != after.names or sizes != mask.sum(axis=1).tolist():
+        return None
+    left = np.zeros_like(screened.data.residual)
+    for k, r in enumerate(after.residuals):
+        left[k, mask[k]] = r
+    system = screened.system
+    moved = np.asarray(after.theta) - np.asarray(before.theta)
+    base = screened.data.base[..., :count]
+    error = left - (screened.data.residual - base @ moved)
+    if not np.sum(error**2) < _ERRS * np.sum(left**2):
+        return None
+    loop = system.loop.with_theta(jax.device_put(after.theta))
+    system = dataclasses.replace(system, loop=loop, residual=left)
+    data = dataclasses.replace(screened.data, residual=left)
+    return dataclasses.replace(screened, system=system, data=data)
 
 
 def offered(

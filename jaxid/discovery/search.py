@@ -24,7 +24,7 @@ from .likelihood import price, score_of
 from .models import Model, Named, Visited, listed, piece_name
 from .ranking import Screened, judge
 from .release import released
-from .screening import screen
+from .screening import carried, screen
 from .support import unsupported
 from .verdict import Outcome
 from .verify import Refits, is_there, needed
@@ -96,7 +96,7 @@ class Search:
         first = self.campaign.piece("start", lambda: self.refits.first(loop))
         # A recording along which the first fit runs away is left out of all that follows.
         self.refits = dataclasses.replace(self.refits, recordings=first.recordings)
-        _, diagnosis = self._screened(first, ())
+        screened, diagnosis = self._screened(first, ())
         # Where noise is strongly coloured, plain output error leaves the parameters far off. A
         # filter fitted to the residual itself would take what is missing for noise.
         self.watched.begin("fit", "fit of the starting model, with its noise known")
@@ -105,13 +105,18 @@ class Search:
         )
         again = dataclasses.replace(again, notes=(*first.notes, *again.notes))
         fit = again if again.succeeded else first
-        self.latest = self._screened(fit, ())
+        if fit is first:
+            self.latest = screened, diagnosis
+        else:
+            self.latest = self._screened(fit, (), carried(screened, first, fit))
         return self._visit((), fit)
 
-    def _screened(self, fit: Fit, effects: Sequence[AbstractEffect]) -> tuple[Screened, Diagnosis]:
+    def _screened(
+        self, fit: Fit, effects: Sequence[AbstractEffect], known: Screened | None = None
+    ) -> tuple[Screened, Diagnosis]:
         """The linear system at a fit with its signatures, and the diagnosis, which is kept."""
         self.watched.begin("screen", "where the model fails")
-        screened = screen(fit, self.asked.catalogue, self.watched.say)
+        screened = known or screen(fit, self.asked.catalogue, self.watched.say)
         diagnosis = judge(fit, screened, self.asked.significance)
         self.forms = max(self.forms, forms_of(screened.hypotheses))
         self.diagnoses[key_of(effects)] = diagnosis.light()

@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..compiling import compiled
-from ..effects import AbstractEffect, Motion
+from ..effects import AbstractEffect, Curve, Motion
 from ..linear_algebra import exponential
 from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..simulation.batch import Batch
 from ..simulation.dynamics import effect_loads
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import each
-from ..simulation.sharing import at_once, taken
+from ..simulation.sharing import at_once, one_by_one, taken
 from .finite import by_structure, differences
 from .hypotheses import Hypothesis, amplitudes, free_of
 from .linear import Linearised, respond
@@ -70,27 +70,46 @@ def _relaxed(
     return exponential(matrix.at[:n, n].set(rate).at[:n, n + 1].set(change))[:n, n]
 
 
+# What a curve may be over beside time, in the order in which `Placed` counts.
+_COORDINATES = ("q", "v", "a", "tau")
+
+
 class Placed(eqx.Module):
     """An effect as if its joints were the first, and which joints those are.
 
-    The order of the joints is data, so that one program serves an effect on any of them.
+    The order of the joints is data, so that one program serves an effect on any of them. The
+    coordinate of a curve is data as well: `along` is its number among time and the positions,
+    velocities, accelerations and torques of all joints, and takes the place of time.
     """
 
     effect: AbstractEffect
-    order: Int[Array, " joints"]
+    order: Int[Array | np.ndarray, " joints"]
+    along: Int[Array | np.ndarray, ""] | None = None
 
     @classmethod
     def of(cls, effect: AbstractEffect, joints: int) -> "Placed":
         """An effect of an arm; one that does not say which joints it depends on stays as it is."""
+        along = None
+        if isinstance(effect, Curve):
+            if effect.coordinate != "t":
+                place = _COORDINATES.index(effect.coordinate) * joints + effect.of
+                along = np.asarray(place)
+            else:
+                along = np.asarray(0)
+            effect = dataclasses.replace(effect, coordinate="t", of=effect.joint)
         own = [getattr(effect, name) for name in effect.joint_fields]
         first = list(dict.fromkeys(own))
         others = [j for j in range(1, joints + 1) if j not in first]
         moved = {n: first.index(j) + 1 for n, j in zip(effect.joint_fields, own, strict=True)}
         made = dataclasses.replace(effect, **moved) if moved else effect
-        return cls(made, jnp.asarray([j - 1 for j in (*first, *others)]))
+        return cls(made, np.asarray([j - 1 for j in (*first, *others)]), along)
 
     def motion(self, motion: Motion) -> Motion:
         """A motion with the effect's joints first."""
+        if self.along is not None:
+            signals = [getattr(motion, name) for name in _COORDINATES]
+            every = jnp.concatenate([motion.t[..., None], *signals], axis=-1)
+            motion = eqx.tree_at(lambda m: m.t, motion, every[..., self.along])
 
         def rows(m):
             return jax.tree.leaves((m.q, m.v, m.a, m.tau, m.held, m.load))
@@ -147,7 +166,6 @@ def _force_by(
     return along
 
 
-@compiled
 def force_and_slopes(
     placed: Placed,
     motion: Motion,
@@ -164,6 +182,16 @@ def force_and_slopes(
     **Returns:** torque on the joint, N·m or N, position read, rad or m, and velocity read, rad/s or
     m/s; the first column is the value, the others are slopes.
     """
+    return one_by_one(lambda one: _force_and_slopes(placed, *one, fields), (motion, left))
+
+
+@compiled
+def _force_and_slopes(
+    placed: Placed,
+    motion: Motion,
+    left: Float[Array, "recordings points joints"],
+    fields: tuple[str, ...] | None,
+) -> Forces:
     effect = placed.effect
     free = free_of(effect)
     if fields is not None:
@@ -179,10 +207,13 @@ def force_and_slopes(
     return each(of_run, motion, left)
 
 
-@compiled
 def left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings points joints"]:
     """Torque that the loop's own effects on the drives leave for the links along the runs."""
+    return one_by_one(lambda one: _left_for_links(loop, one), motion)
 
+
+@compiled
+def _left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings points joints"]:
     def remaining(at: Motion, states: tuple[Float[Array, " _"], ...]):
         return at.tau - effect_loads(loop, at, states)[0]
 
@@ -243,7 +274,7 @@ def _grouped(effects: Sequence[AbstractEffect], joints: int) -> list[tuple[Place
     """Effects that a program serves together stacked, with their places."""
     placed = [Placed.of(effect, joints) for effect in effects]
     return [
-        (jax.tree.map(lambda *leaves: jnp.stack(leaves), *(placed[k] for k in places)), places)
+        (jax.tree.map(lambda *leaves: np.stack(leaves), *(placed[k] for k in places)), places)
         for places in by_structure(placed)
     ]
 
@@ -273,9 +304,7 @@ def _responses(
             table[..., behind] = respond(alone, "pull", push[..., np.array(behind)])
         return table[0]
 
-    # The first compiles what the others, which share the cores, then find.
-    first = along(0)
-    return np.stack([first, *at_once(along, range(1, len(left)))])
+    return np.stack(at_once(along, range(len(left))))
 
 
 def _columns(

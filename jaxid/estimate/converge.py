@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -71,10 +72,15 @@ def converge(
     pieces = pieces_of(recordings, method.window)
     signals = compared_signals(method, loop)
     batch = prepare(loop, pieces) if batch is None else batch
-    free = jnp.asarray(estimated_starts(method, pieces, batch))
-    first = jnp.asarray(first_weights(loop, pieces, signals))
+    estimated = estimated_starts(method, pieces, batch)
+    free, first, start = jax.device_put(
+        (
+            estimated,
+            first_weights(loop, pieces, signals),
+            np.concatenate([batch.q0, batch.v0], axis=1),
+        )
+    )
     bounds = Bounds.of(loop.free_parameters)
-    start = jnp.asarray(np.concatenate([batch.q0, batch.v0], axis=1))
     if weights is None and filters is not None:
         weights = _weights_of(filters, first)
     # The weight of a single output only scales the loss.
@@ -85,8 +91,8 @@ def converge(
 
     def posed(weights: Float[Array, " outputs"]) -> Problem:
         within = bounds.lower, bounds.upper
-        noise = jnp.asarray(_taps(filters, weights))
-        kinds = signals, bool(free.any()), method.mesh
+        noise = jax.device_put(_taps(filters, weights))
+        kinds = signals, bool(estimated.any()), method.mesh
         mix = _mix(filters, weights)
         return Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix)
 

@@ -4,7 +4,6 @@ import dataclasses
 import time
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -27,7 +26,7 @@ def physical(loop: ClosedLoop, theta: Float[np.ndarray, " parameters"]) -> Close
 
     - `theta`: values of the parameters in which torque is linear, `(parameters,)`.
     """
-    moved, inertia = _moved(loop, jnp.asarray(theta))
+    moved, inertia = _moved(loop, np.asarray(theta))
     return moved if float(inertia) > 0 else loop
 
 

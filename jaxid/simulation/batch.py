@@ -13,7 +13,7 @@ from ..control import Reading, Reference
 from ..effects import recording_label
 from ..errors import JaxidError, ModelError, RecordingError
 from ..recording import Recording, Recordings
-from ..signals.smoothing import Band
+from ..signals.smoothing import Band, shared_length
 from .loop import ClosedLoop
 
 
@@ -264,8 +264,8 @@ def prepare(
         _check_noise(noise, recordings)
     period = loop.controller.period
     grids = [_grid(r, period) for r in recordings]
-    length = max(len(grid) for grid, _ in grids)
-    samples = max(r.samples for r in recordings)
+    length = shared_length(max(len(grid) for grid, _ in grids))
+    samples = shared_length(max(r.samples for r in recordings))
     noises = [None] * len(recordings) if noise is None else list(noise)
     held = held_names(recordings)
     rows = [
@@ -309,7 +309,7 @@ def band_of(loop: ClosedLoop, recordings: Recordings | Sequence[Recording]) -> B
     given = [c for c in cutoffs if c is not None]
     if len(given) < len(cutoffs):
         return None
-    longest = max(r.samples for r in recordings)
+    longest = shared_length(max(r.samples for r in recordings))
     return Band.of(list(recordings), given, longest, loop.controller.moving)
 
 

@@ -1,5 +1,6 @@
 """Simulation of a loop along recordings, and its exact sensitivities."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -26,6 +27,7 @@ from .integration import (
     with_tangents,
 )
 from .loop import ClosedLoop
+from .sharing import one_by_one
 from .steps import set_substeps, with_forward_mode, with_rolled_stages, with_substeps
 
 
@@ -102,12 +104,13 @@ def run(
         states, seen, code = _ticking(loop, intervals, x0, substeps, rows)
     else:
         states, code = integrate(loop, intervals, x0, substeps)
-        seen = _at_points(loop, lambda i, x: observe(loop, i, x, rows)[1], intervals, states)
+        seen = at_points(loop, lambda i, x: observe(loop, i, x, rows)[1], intervals, states)
     return states, seen, unless_finite(code, states[-1])
 
 
-def _at_points(loop: ClosedLoop, fun: Callable, *args):
-    """Maps a function over grid points, as one batch if the motion is given."""
+def at_points(loop: ClosedLoop, fun: Callable, *args):
+    """Maps a function of an interval and more over grid points, as one batch if the motion is
+    given."""
     return jax.vmap(fun)(*args) if imposed(loop) else each(fun, *args)
 
 
@@ -172,7 +175,7 @@ def run_with_sensitivities(
             shown = lambda loop, x: observe(loop, interval, x, rows)[1]  # noqa: E731
             return with_tangents(shown, loop, columns)(x, tangents)
 
-        seen, slopes = _at_points(loop, at, intervals, states, tangents)
+        seen, slopes = at_points(loop, at, intervals, states, tangents)
         code = unless_finite(success(), states[-1])
         return Sensitivities(seen, slopes, states[-1], tangents[-1], code)
     theta, loop = loop.theta, with_forward_mode(loop)
@@ -247,6 +250,8 @@ def simulate_batch(loop: ClosedLoop, batch: Batch) -> Simulated:
     forward = isinstance(loop.stepping.adjoint, diffrax.ForwardMode)
     if loop.stepping.control is None and forward:
         # One program for any number of steps, so that refining them needs no compilation.
-        substeps = jnp.asarray(loop.stepping.substeps or 1)
+        substeps = np.asarray(loop.stepping.substeps or 1)
         loop = set_substeps(loop, None, settled=False)
-    return jax.device_get(_simulate(loop, batch, substeps))
+    # What is compared does not enter, and would only make programs differ.
+    batch = dataclasses.replace(batch, band=None)
+    return jax.device_get(one_by_one(lambda one: _simulate(loop, one, substeps), batch))

@@ -5,7 +5,7 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -54,6 +54,23 @@ def at_once(
 def taken(each: PyTree, rows: Int[np.ndarray, " rows"]) -> PyTree:
     """The given rows of the leading axis of every leaf."""
     return jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[rows], each))
+
+
+def one_by_one(fun: Callable[[Any], Any], each: PyTree) -> Any:
+    """`fun` of every recording alone, on several threads; an accelerator takes all at once.
+
+    A program for one recording serves any number of them.
+
+    **Arguments:**
+
+    - `fun`: from recordings to arrays, both with `(recordings,)` before the axes of each leaf.
+    - `each`: the recordings.
+    """
+    count = jax.tree.leaves(each)[0].shape[0]
+    if count == 1 or jax.default_backend() != "cpu":
+        return fun(each)
+    parts = at_once(lambda k: fun(taken(each, np.array([k]))), range(count))
+    return jax.device_put(jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts))
 
 
 class EndToEnd:

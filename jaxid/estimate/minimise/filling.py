@@ -3,7 +3,7 @@
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -41,7 +41,7 @@ class Filling(eqx.Module):
         """Values of all."""
         p, r = self._room()
         theta, start = np.pad(y[0], (0, p)), np.pad(y[1], ((0, r), (0, 0)))
-        return jnp.asarray(theta), jnp.asarray(start)
+        return jax.device_put((theta, start))
 
     def emptied(
         self, y: tuple[Float[Any, " filled"], Float[Any, "places estimated"]]

@@ -114,7 +114,7 @@ def descend(
         tolerance=np.float64(settings.tolerance),
         worth=np.float64(settings.worth),
     )
-    state = solver.init(None, y, None, {}, None, None, frozenset())
+    state = _begun(solver, y)
     trial = point
     for k in range(1, settings.max_steps + 1):
         # On the host, where these few numbers add up without a program for each shape.
@@ -156,6 +156,11 @@ _BY_RESULT = {
 def _words(name: str) -> str:
     """The message of a diffrax result."""
     return diffrax.RESULTS[getattr(diffrax.RESULTS, name)]
+
+
+@compiled
+def _begun(solver: LevenbergMarquardt, y):
+    return solver.init(None, y, None, {}, None, None, frozenset())
 
 
 @compiled
