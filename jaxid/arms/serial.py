@@ -122,7 +122,10 @@ class SerialArm(AbstractArm):
         """
         drawn = jnp.ravel(self.bodies)
         changed = self.base - self.combined @ drawn
-        return drawn.at[jnp.asarray(self.leading)].add(changed).reshape(self.bodies.shape)
+        # Piece by piece: an indexed update would break up the kernel of a simulation's loop.
+        place = {leading: k for k, leading in enumerate(self.leading)}
+        pieces = [changed[place[k]] if k in place else jnp.zeros(()) for k in range(drawn.size)]
+        return (drawn + jnp.stack(pieces)).reshape(self.bodies.shape)
 
     def combinations(self) -> dict[str, str]:
         """Each base parameter as a sum of link parameters."""
