@@ -34,7 +34,7 @@ PHRASES = {
     r"wrong valley|finds? back\b": "wrong minimum, converges",
 }
 # Their docstrings and messages have not been rewritten yet.
-LATER = {"cli", "discovery", "display", "excitation", "report", "simulation"}
+LATER = {"discovery", "display", "excitation", "report", "simulation"}
 
 
 def pages() -> dict[str, str]:
