@@ -189,11 +189,11 @@ def test_closed_loop_sensitivities_are_those_of_the_simulation():
 
 
 def test_result_shows_itself(found):
-    assert "left of the limits" in repr(found)
+    assert "margins to the limits" in repr(found)
     assert list(found.table().index) == list(found.names)
     assert found.reference(periods=2).duration == pytest.approx(8.0)
     assert len(found.plot().data) >= 2
-    assert "left of the limits" in found._repr_html_()
+    assert "margins to the limits" in found._repr_html_()
 
 
 # --- what cannot be done is said ------------------------------------------------------------------
@@ -217,7 +217,7 @@ def test_the_limit_that_leaves_no_pose_is_named():
     with pytest.raises(LimitsError, match=r"limits.torque of joint 1 is 2, but to stand still"):
         jaxid.optimal_excitation(loop(), held_out)
     nowhere = jaxid.PlanarReach((0.3, 0.2), low=(0.6, -0.4), high=(0.8, 0.4))
-    with pytest.raises(LimitsError, match=r"limits.workspace leaves no pose"):
+    with pytest.raises(LimitsError, match=r"limits.workspace allows no pose"):
         jaxid.optimal_excitation(loop(), limits(workspace=nowhere))
     with pytest.raises(LimitsError, match=r"limits.high of joint 2 leaves no room at the start"):
         jaxid.optimal_excitation(loop(), limits(), start=[0.0, 3.0])
