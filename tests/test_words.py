@@ -34,7 +34,7 @@ PHRASES = {
     r"wrong valley|finds? back\b": "wrong minimum, converges",
 }
 # Their docstrings and messages have not been rewritten yet.
-LATER = {"discovery", "simulation"}
+LATER = {"discovery"}
 
 
 def pages() -> dict[str, str]:
