@@ -111,7 +111,7 @@ def test_only_arms_in_space_are_written_and_only_to_their_own_urdf(described, tm
     one = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
       <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
       <joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></robot>"""
-    with pytest.raises(ModelError, match="has 1 joints and"):
+    with pytest.raises(ModelError, match="has 1 joints, but"):
         jaxid.write_urdf(jaxid.serial(path, tip=tip), one, tmp_path / "out.urdf")
     negative = np.asarray(jaxid.serial(one).arm.bodies) * [*[1] * 9, -1]
     with pytest.raises(ModelError, match="physical_bodies"):
