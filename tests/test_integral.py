@@ -277,7 +277,7 @@ def test_poles_are_checked(smooth):
 
 
 def test_what_fourier_cannot_do_is_said(smooth):
-    with pytest.raises(FitError, match=r"500 harmonics cannot be told from 1000 samples"):
+    with pytest.raises(FitError, match=r"500 harmonics cannot be determined from 1000 samples"):
         jaxid.fit(loop(), recording(smooth), jaxid.FourierLS(harmonics=500))
     rng = np.random.default_rng(8)
     t = np.arange(0.0, 10.0, 0.01)

@@ -199,9 +199,9 @@ def test_a_vector_filter_takes_noise_that_joints_share(fits, recording):
 @pytest.mark.parametrize(
     ("method", "says"),
     [
-        (jaxid.SeparablePEM(GIVEN, orders=(2, 1500)), "shorter than the noise filter"),
+        (jaxid.SeparablePEM(GIVEN, orders=(2, 1500)), "too few for the noise filter"),
         (jaxid.SeparablePEM(GIVEN, orders=(2, 400)), "lower the order"),
-        (jaxid.JointPEM(GIVEN, orders=(2, 1500)), "shorter than the noise filter"),
+        (jaxid.JointPEM(GIVEN, orders=(2, 1500)), "too few for the noise filter"),
         (jaxid.SeparablePEM(GIVEN, orders=(2,)), "one for each"),
         (jaxid.JointPEM(GIVEN, orders=(2, 2, 2)), "one for each"),
     ],

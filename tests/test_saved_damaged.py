@@ -154,7 +154,7 @@ def test_a_header_that_lies(shape: tuple[int, ...]) -> None:
     np.lib.format.write_array_header_1_0(
         buffer, {"descr": "<f8", "fortran_order": False, "shape": shape}
     )
-    with pytest.raises(ValueError, match="promises"):
+    with pytest.raises(ValueError, match="declares"):
         arrays.npy(buffer.getvalue() + bytes(16))
 
 

@@ -34,7 +34,7 @@ def fit(
     - `recordings`: one or several of the same robot.
     - `method`: `OEM()` by default.
 
-    **Raises:** `FitError`, `RecordingError` or `ModelError` where the three do not fit together.
+    **Raises:** `FitError`, `RecordingError` or `ModelError` if the three do not fit together.
     """
     recordings = Recordings.of(recordings)
     check_joints(loop, recordings[0])

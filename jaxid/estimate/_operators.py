@@ -56,7 +56,7 @@ class Operator(eqx.Module):
         - `k`: at most the number of poles.
         - `x`: samples, joined by a cubic spline: joined by lines, what is differentiated and what
           is not would be off by different shares, of the size of (λ step)².
-        - `held`: True where each sample holds until the next instead.
+        - `held`: True if each sample holds until the next instead.
         """
         import scipy
 

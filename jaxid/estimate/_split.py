@@ -127,7 +127,7 @@ def split_rows(
     - `states`: where velocities come from. `operator`: with one pole or two.
     - `transient`: how the operator's unknown initial state is treated.
 
-    **Raises:** `FitError` where an effect needs an acceleration, or no rows are left.
+    **Raises:** `FitError` if an effect needs an acceleration, or no rows are left.
     """
     _check_effects(loop, method)
     states = states.resolved(recording)
@@ -207,7 +207,7 @@ def fit_rows(
     - `weights`: `"joint"`, or `"encoder"` for the covariance that follows from the resolution.
     - `rows_of`: gives the rows of a recording.
 
-    **Raises:** `FitError` where the resolution is not known, or the rows are too few.
+    **Raises:** `FitError` if the resolution is not known, or the rows are too few.
     """
     started = time.perf_counter()
     if weights == "encoder":

@@ -63,7 +63,7 @@ def converge(
 
     **Arguments:**
 
-    - `filters`: noise filter of each output; white noise where None.
+    - `filters`: noise filter of each output; white noise if None.
     - `deadline`: of `time.perf_counter`; after it the best values so far are returned.
     - `weights`: start values, if known; filters contain theirs.
     - `batch`: the pieces prepared, if they are already.

@@ -17,8 +17,8 @@ class FourierLS(AbstractMethod):
 
     **Arguments:**
 
-    - `period`: of the motion, s; found where None.
-    - `harmonics`: how many; chosen where None.
+    - `period`: of the motion, s; found if None.
+    - `harmonics`: how many; chosen if None.
     - `weights`: `"joint"` (each joint by its own deviation), or `"encoder"` (the covariance that
       follows from the recordings' resolution). To first order, and with what the series leaves out
       taken for noise: deviations come out too large for fine encoders and too small for coarse.

@@ -48,7 +48,7 @@ def stack(loop: ClosedLoop, recordings: Recordings, filtering: Filtering, motion
     - `filtering`: of the motion and, in parallel, of torque and columns.
     - `motions`: simulated signals instead of the filtered ones, one for each recording.
 
-    **Raises:** `FitError` where the filtering does not suit a recording.
+    **Raises:** `FitError` if the filtering does not suit a recording.
     """
     columns, rights = [], []
     for k, recording in enumerate(recordings):

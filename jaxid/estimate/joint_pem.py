@@ -44,7 +44,7 @@ class JointPEM(AbstractMethod):
     - `coupled`: whether every output's filter depends on the past of all outputs.
     - `deviations`: `"white"` for (A.1), `"sandwich"` or `"paper"`.
 
-    **Raises:** `NoiseError` where the data do not allow such filters; its `fit` is the fit so far.
+    **Raises:** `NoiseError` if the data do not allow such filters; its `fit` is the fit so far.
     """
 
     oem: OEM = OEM()

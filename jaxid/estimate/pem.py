@@ -63,7 +63,7 @@ class SeparablePEM(AbstractMethod):
     - `tolerance`: relative change of the prediction error's variance at which it stops.
     - `rounds`: largest number of alternations.
 
-    **Raises:** `NoiseError` where the residuals allow no such filter; its `fit` is the fit so far.
+    **Raises:** `NoiseError` if the residuals allow no such filter; its `fit` is the fit so far.
     """
 
     oem: OEM = OEM()
@@ -148,7 +148,7 @@ def keeping(done: Converged, method: OEM, recordings: Recordings) -> Iterator[No
 
 
 def residual_series(done: Converged) -> list[np.ndarray]:
-    """Measured less simulated, `(samples, outputs)` for each recording, in their own units."""
+    """Measured minus simulated, `(samples, outputs)` for each recording, in their own units."""
     raw = np.asarray(done.minimum.point.found.raw) / np.asarray(done.weights)
     mask = np.asarray(done.batch.kept)
     return [row[there] for row, there in zip(raw, mask, strict=True)]
@@ -159,7 +159,7 @@ def noise_filters(
 ) -> tuple[ARFilter, ...] | VectorAR:
     """The AR filter of each output's residuals, or of all together, over all recordings.
 
-    **Raises:** `NoiseError` where the residuals do not allow it.
+    **Raises:** `NoiseError` if the residuals do not allow it.
     """
     residuals = residual_series(done)
     outputs = residuals[0].shape[1]

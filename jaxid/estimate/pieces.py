@@ -65,7 +65,7 @@ def rejoined(recordings, pieces, measured, errors):
 def compared_signals(method: OutputErrorSettings, loop: ClosedLoop) -> tuple[str, ...]:
     """The outputs of a method, of `"tau"` and `"q"`.
 
-    **Raises:** `FitError` where the recorded torque drives the loop and is to be compared.
+    **Raises:** `FitError` if the recorded torque drives the loop and is to be compared.
     """
     output = method.output or loop.controller.judged
     if output != "position" and isinstance(loop.controller, OpenLoop):

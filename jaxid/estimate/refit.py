@@ -231,7 +231,7 @@ def redrawn(
 
     - `noise`: on the outputs, for each recording.
 
-    **Raises:** `FitError` for regressions, and where only part of the signals is compared.
+    **Raises:** `FitError` for regressions, and if only part of the signals is compared.
     """
     optimum = optimum_of(fit, "draws")
     problem = optimum.problem

@@ -82,7 +82,7 @@ def filtered(recording: Recording, filtering: Filtering) -> Simulated:
 def linear_parameters(loop: ClosedLoop) -> tuple[Parameter, ...]:
     """The free parameters in which torque is linear.
 
-    **Raises:** `FitError` where there are none.
+    **Raises:** `FitError` if there are none.
     """
     found = tuple(p for p in loop.free_parameters if p.declaration.linear)
     if not found:

@@ -63,8 +63,8 @@ class Fit(AbstractShown):
     """Result of an estimation: the fitted loop, covariance, residuals, status.
 
     - `loop`: the model with the estimated values.
-    - `covariance`: of `loop.theta`, `(parameters, parameters)`; infinite where not determined.
-    - `residuals`: measured less simulated torque (for a position output: position), one
+    - `covariance`: of `loop.theta`, `(parameters, parameters)`; infinite if not determined.
+    - `residuals`: measured minus simulated torque (for a position output: position), one
       `(samples, joints)` for each recording.
     - `undetermined`: sentences that name combinations of parameters that the data do not determine.
     - `notes`: other remarks.
@@ -108,7 +108,7 @@ class Fit(AbstractShown):
 
     @property
     def std(self) -> Float[np.ndarray, " parameters"]:
-        """Standard deviations, in the units of the parameters; infinite where not determined."""
+        """Standard deviations, in the units of the parameters; infinite if not determined."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -192,7 +192,7 @@ class Fit(AbstractShown):
 
         - `path`: by convention with the ending `.jaxid`; an existing file is replaced.
 
-        **Raises:** `SaveError` where it cannot be written.
+        **Raises:** `SaveError` if it cannot be written.
         """
         return save(self, path)
 

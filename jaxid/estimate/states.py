@@ -120,8 +120,8 @@ class FourierStates(AbstractStates):
 
     **Arguments:**
 
-    - `period`: of the motion, s; found from the recording where None.
-    - `harmonics`: how many; found from the recording where None.
+    - `period`: of the motion, s; found from the recording if None.
+    - `harmonics`: how many; found from the recording if None.
     """
 
     period: float | None = eqx.field(static=True, default=None)
@@ -130,7 +130,7 @@ class FourierStates(AbstractStates):
     def settled(self, recording: Recording) -> Harmonics:
         """Period and number of harmonics for a recording.
 
-        **Raises:** `FitError` where it is not periodic, or too short for the harmonics.
+        **Raises:** `FitError` if it is not periodic, or too short for the harmonics.
         """
         return settle_harmonics(recording, period_of(recording, self.period), self.harmonics)
 

@@ -54,7 +54,7 @@ class Filling(eqx.Module):
 
         **Arguments:**
 
-        - `loss`: infinite where the point is no good.
+        - `loss`: infinite if the point is no good.
         """
         p, r = self._room()
         _, gram, slope, start_gram, start_slope, cross = sums.added()

@@ -72,7 +72,7 @@ class Sums(eqx.Module):
 
         **Arguments:**
 
-        - `loss`: infinite where the point is not acceptable.
+        - `loss`: infinite if the point is not acceptable.
         """
         _, gram, slope, start_gram, start_slope, cross = self.added()
         return Products(loss / 2, (slope, start_slope), Arrow(gram, start_gram, cross))
@@ -95,9 +95,9 @@ class Point(eqx.Module):
     """A set of parameter values and initial states, and the least-squares problem around it.
 
     - `theta`: parameter values; `start`: initial position and velocity of each recording.
-    - `found`: residual and derivatives. The latter are None where they would fill the memory;
+    - `found`: residual and derivatives. The latter are None if they would fill the memory;
       `with_derivatives` gives them.
-    - `loss`: sum of squared weighted residuals; infinite where values are not physical or the
+    - `loss`: sum of squared weighted residuals; infinite if values are not physical or the
       simulation fails.
     """
 
@@ -114,8 +114,8 @@ class Problem(eqx.Module):
     - `free`: one for recordings whose initial state is estimated, else zero.
     - `mesh`: devices that share the recordings; None for one.
     - `coefficients`: of the noise filter, estimated after the loop's parameters in one vector;
-      None where the filter is given.
-    - `mix`: makes filtered outputs white and uncorrelated, `(outputs, outputs)`; None where the
+      None if the filter is given.
+    - `mix`: makes filtered outputs white and uncorrelated, `(outputs, outputs)`; None if the
       weights do all of it.
     """
 

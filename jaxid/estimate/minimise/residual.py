@@ -28,7 +28,7 @@ class Sensitivity(eqx.Module):
     """Weighted residual of a batch and its derivatives, at one set of parameter values.
 
     `residual` is zero where there is no sample; `start` is its derivative by each recording's own
-    initial position and velocity, None where it is not estimated. `raw` is the residual before the
+    initial position and velocity, None if it is not estimated. `raw` is the residual before the
     noise filter. Derivatives that were not kept are None. `result` is zero for recordings whose
     simulation succeeded, see `jaxid.simulation.reason`.
     """
@@ -49,7 +49,7 @@ def sensitivity(
     signals: tuple[str, ...],
     free_start: bool,
 ) -> Sensitivity:
-    """Weighted residual (measured less simulated) and its exact derivatives.
+    """Weighted residual (measured minus simulated) and its exact derivatives.
 
     **Arguments:**
 
