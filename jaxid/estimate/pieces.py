@@ -70,7 +70,7 @@ def compared_signals(method: OutputErrorSettings, loop: ClosedLoop) -> tuple[str
     output = method.output or loop.controller.judged
     if output != "position" and isinstance(loop.controller, OpenLoop):
         raise FitError(
-            "the recorded torque drives this loop, so there is no torque to compare: use "
+            "the recorded torque is the input of this loop and cannot be compared: use "
             "OEM(output='position')"
         )
     return {"torque": ("tau",), "position": ("q",), "both": ("tau", "q")}[output]
