@@ -284,7 +284,7 @@ def test_a_gap_and_windows_that_forget_are_said(cases):
     assert not any("gap" in note for note in jaxid.fit(jaxid.scara(), one, jaxid.IDIM()).notes)
     windows = jaxid.OEM(window=5.0, max_steps=2)
     fit = jaxid.fit(jaxid.scara().add(Hysteresis(joint=2, level=0.01)), one, windows)
-    assert any("states of hysteresis at rest" in note for note in fit.notes)
+    assert any("states of hysteresis start at rest" in note for note in fit.notes)
     # Windows share their end samples, which count once.
     assert len(fit.residuals[0]) == one.samples
 
