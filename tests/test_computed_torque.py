@@ -60,7 +60,7 @@ def test_batch_simulator_agrees_with_the_continuous_one():
         def position(self, t):
             return [0.4, 0.4]
 
-    # M̂ = [[0.2, 0.1], [0.1, 0.1]] is no diagonal law, so its torque is prescribed by hand.
+    # M̂ = [[0.2, 0.1], [0.1, 0.1]] is not a diagonal law, so its torque is prescribed.
     class Law:
         period = None
 

@@ -201,7 +201,7 @@ def test_open_loop_gives_the_recorded_torque():
 # --- tracking ---------------------------------------------------------------------------------
 
 
-# The low-pass knows nothing of what comes before and after, some five of its time constants.
+# The low-pass has no samples before the start and after the end: about five time constants.
 INSIDE = slice(10, -30)
 
 

@@ -1,4 +1,4 @@
-"""Output error on a robot that jaxid did not simulate: truth, honesty, and how fits fail."""
+"""Output error on a robot that jaxid did not simulate: truth, deviations, and failing fits."""
 
 import dataclasses
 from typing import Literal
@@ -138,7 +138,7 @@ def test_position_as_output(cases, output):
     fit = jaxid.fit(jaxid.scara(), both(cases[0]), jaxid.OEM(output=output))
     truth = np.array([getattr(cases[0].plant, n) for n in fit.names])
     assert fit.status is jaxid.Status.converged
-    # Encoder steps are not noise at standstill, so deviations are not held against the truth here.
+    # Encoder steps are not noise at standstill, so deviations are not compared with the truth here.
     assert np.abs(fit.theta / truth - 1)[:2].max() < 0.02
 
 

@@ -218,7 +218,7 @@ def test_integral_beats_filtered_and_difference_at_coarse_encoders(smooth):
             fit = jaxid.fit(loop(), recording(smooth, q=q, resolution=step), method)
             errors[name].append(share(fit))
     size = {name: np.sqrt(np.mean(np.square(e))) for name, e in errors.items()}
-    # Filtered and difference have both lost the arm at 13 bits; which is worse says nothing.
+    # At 13 bits filtered and difference both fail; it does not matter which is worse.
     assert size["integral"] < 0.5 * min(size["filtered"], size["difference"])
 
 

@@ -240,7 +240,7 @@ def test_flipped_bytes(tmp_path: Path, whole: bytes, small_fit: jaxid.Fit, data:
     except SaveError:
         refused(tmp_path / "fit", bytes(content))
     else:
-        # A flip in what nobody reads, such as a member's date.
+        # A flip in bytes that are not read, such as a member's date.
         same(small_fit, back)
 
 

@@ -185,7 +185,7 @@ def test_effects_share_the_sharpness_that_is_estimated_for_their_joint():
 
 @pytest.mark.slow
 def test_a_load_that_drives_the_axis_into_its_limit_is_found():
-    """Its signature promises an eighth of it, and filters that know no more bar the way.
+    """Its signature predicts an eighth of it, and filters of that prediction prevent convergence.
 
     The drive is at the controller's limit in both recordings, in the loaded one for longer.
     """

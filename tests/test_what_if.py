@@ -1,4 +1,4 @@
-"""An effect moved by hand: the linear system's answer against simulations and refits."""
+"""An effect set by sliders: the linear system's answer, compared with simulations and refits."""
 
 import dataclasses
 
