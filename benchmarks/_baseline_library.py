@@ -1,8 +1,8 @@
-"""A mechanical library: torques that a joint may feel along a motion, each with what it is called.
+"""A library of mechanical effects: named torques of a joint along a motion.
 
-Written for the baselines, from textbooks; it shares no formula with jaxid's catalogue, and has the
-shapes of the effects that the worlds hide on a grid. A constant counts as friction that is not the
-same in both directions, since the worlds hide no other constant torque.
+It was written for the baselines, from textbooks, and shares no formula with jaxid's catalogue. It
+contains the shapes of the effects that the worlds hide, on a grid. A constant counts as asymmetric
+friction, because the worlds hide no other constant torque.
 """
 
 from collections.abc import Iterator
@@ -12,13 +12,13 @@ import numpy as np
 
 from ._baseline_rows import Columns, Motion, Table, residual
 
-# Highest tones of what is left that are offered as disturbances, by joint.
+# Number of the highest tones of the residual that become disturbance candidates, by joint.
 TONES = 6
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Columns that stand for one effect on one joint (from 0), with a shape from a grid."""
+    """Columns of one effect on one joint (from 0), with a shape from a grid."""
 
     family: str
     joint: int
@@ -30,7 +30,7 @@ def library(table: Table, slides: tuple[bool, ...]) -> list[Candidate]:
 
     **Arguments:**
 
-    - `slides`: whether each joint does; ripple and turns are of those that turn.
+    - `slides`: whether each joint is prismatic; ripples and turns are only for revolute joints.
     """
     tones = _tones(table)
     return [
@@ -108,7 +108,7 @@ def _of_joint(
 
 
 def _lagging(motion: Motion, joint: int, reach: float) -> np.ndarray:
-    """A friction that follows the direction over a length: z' = v/reach − |v| z/reach, exactly."""
+    """Friction that follows the direction over a length: z' = v/reach − |v| z/reach, exactly."""
     v, step = motion.v[:, joint], np.diff(motion.time, append=motion.time[-1])
     state, along = 0.0, np.zeros(len(v))
     for k, (speed, h) in enumerate(zip(v.tolist(), step.tolist(), strict=True)):
@@ -119,7 +119,7 @@ def _lagging(motion: Motion, joint: int, reach: float) -> np.ndarray:
 
 
 def _tones(table: Table) -> list[list[float]]:
-    """The highest peaks of the spectrum of what the rigid robot leaves of each joint, Hz."""
+    """The highest peaks of the spectrum of the rigid robot's residual, by joint, Hz."""
     rest = residual(table.base, table.right)
     times = np.concatenate([m.picked(m.time) for m in table.motions])
     which = np.repeat(np.arange(len(table.motions)), [len(m.picked(m.time)) for m in table.motions])
@@ -130,7 +130,7 @@ def _tones(table: Table) -> list[list[float]]:
         power = np.zeros(len(grid))
         own = rest[table.joint == j]
         for k in range(len(table.motions)):
-            # Rows at rest are missing: a sum over the times that are there.
+            # Rows at rest are missing, so the sum is over the existing times.
             here = which[kept] == k
             waves = np.exp(-2j * np.pi * np.outer(grid, times[kept][here]))
             power += np.abs(waves @ own[here]) ** 2

@@ -1,6 +1,6 @@
-"""Rows of a rigid robot's regression, done by hand: SciPy's filters, Pinocchio's regressor.
+"""Rows of a rigid robot's regression, by SciPy's filters and Pinocchio's regressor.
 
-Nothing here knows jaxid's arms, effects or search; of jaxid there is the recording that was read.
+Of jaxid only the reading of recordings is used, not its arms, effects or search.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,13 +16,13 @@ import jaxid
 # Sample rate over cutoff, and over the rate of the rows.
 CUTOFF = 10
 THINNED = 4
-# Slower than this share of the top speed, what friction does is not known from the motion.
+# Below this share of the top speed, the motion does not determine friction.
 SLOW = 0.01
-# Widths of a sign of velocity that are tried, in shares of the top speed.
+# Trial widths of the sign of velocity, in shares of the top speed.
 WIDTHS = tuple(np.geomspace(0.001, 0.06, 13).tolist())
-# Seconds of a block; every third block is left out to choose by.
+# Seconds of a block; every third block is left out of the fit for choices.
 BLOCK = 1.0
-# Columns of a joint of its own.
+# Number of columns that each joint has on its own.
 OWN = 4
 
 
@@ -45,7 +45,7 @@ class Motion:
 
         **Arguments:**
 
-        - `urdf`: the robot as its drawing has it; its masses and inertias are not used.
+        - `urdf`: the drawn robot; its masses and inertias are not used.
         """
         time, rate = np.asarray(recording.time), float(recording.rate)
         q, tau = (_passed(np.asarray(x), rate) for x in (recording.q, recording.tau))
@@ -54,11 +54,11 @@ class Motion:
         return cls(time, q, v, a, tau, rate, _regressor(urdf, q, v, a))
 
     def thinned(self, x: np.ndarray) -> np.ndarray:
-        """Signals along the motion, low-passed as its torque was, at fewer samples."""
+        """Signals along the motion, with the low-pass of its torque, at fewer samples."""
         return self.picked(_passed(x, self.rate))
 
     def picked(self, x: np.ndarray) -> np.ndarray:
-        """The samples of the rows; those that the filter's ends reach are dropped."""
+        """The samples of the rows, without those near the ends that the filter affects."""
         ends = 2 * CUTOFF
         return x[ends : len(x) - ends : THINNED]
 
@@ -67,7 +67,7 @@ def _passed(x: np.ndarray, rate: float) -> np.ndarray:
     return signal.sosfiltfilt(signal.butter(4, rate / CUTOFF, fs=rate, output="sos"), x, axis=0)
 
 
-# A torque by amplitude, (samples, columns), that one joint feels along a motion.
+# Torque of one joint along a motion, by amplitude, (samples, columns).
 Columns = Callable[[Motion], np.ndarray]
 
 
@@ -77,8 +77,8 @@ class Table:
 
     **Arguments:**
 
-    - `widths`: of the sign of velocity by joint, rad/s or m/s.
-    - `scale`: deviation of the torque that is left by joint, by which rows are weighted.
+    - `widths`: widths of the sign of velocity by joint, rad/s or m/s.
+    - `scale`: deviation of the residual torque by joint, by which rows are weighted.
     """
 
     motions: tuple[Motion, ...]
@@ -87,12 +87,12 @@ class Table:
 
     @property
     def joints(self) -> int:
-        """How many there are."""
+        """Number of joints."""
         return self.motions[0].q.shape[1]
 
     @cached_property
     def moving(self) -> list[np.ndarray]:
-        """In which thinned samples, of all motions in a row, a joint moves."""
+        """The thinned samples, of all motions concatenated, in which a joint moves."""
         v = np.abs(np.concatenate([m.picked(m.v) for m in self.motions]))
         return list((v > SLOW * v.max(axis=0)).T)
 
@@ -109,13 +109,13 @@ class Table:
 
     @cached_property
     def plain(self) -> np.ndarray:
-        """The rigid robot's amplitudes where nothing is added, `(columns,)`."""
+        """The rigid robot's amplitudes without other effects, `(columns,)`."""
         return solved(self.base, self.right)
 
     def load(self, motion: Motion) -> np.ndarray:
-        """The torque that moves the links and rotors by the rigid robot, `(samples, joints)`.
+        """The torque that moves links and rotors of the rigid robot, `(samples, joints)`.
 
-        The recorded torque in its place would explain itself wherever the drive pushes.
+        The recorded torque cannot be used instead, because it would explain itself.
         """
         own = motion.bodies.shape[-1]
         rotors = self.plain[own::OWN] * motion.a
@@ -123,7 +123,7 @@ class Table:
 
     @cached_property
     def left_out(self) -> np.ndarray:
-        """Which rows are left out to choose by."""
+        """The rows that are left out of the fit for choices."""
         times = np.concatenate([m.picked(m.time - m.time[0]) for m in self.motions])
         return np.concatenate([(times[kept] // BLOCK) % 3 == 2 for kept in self.moving])
 
@@ -137,20 +137,20 @@ class Table:
         return np.concatenate([x[kept, j] / self.scale[j] for j, kept in enumerate(self.moving)])
 
     def block(self, joint: int, columns: Columns) -> np.ndarray:
-        """What one joint (from 0) feels, as rows, `(rows, columns)`."""
+        """Torques of one joint (from 0) as rows, `(rows, columns)`."""
         felt = np.concatenate([m.thinned(columns(m)) for m in self.motions])
         spread = np.zeros((len(felt), self.joints, felt.shape[1]))
         spread[:, joint] = felt
         return self.rows(spread)
 
     def features(self, columns: Columns, joint: int) -> np.ndarray:
-        """Signals along the motions at the rows of one joint, `(rows of it, columns)`."""
+        """Signals along the motions at the rows of one joint, `(its rows, columns)`."""
         picked = np.concatenate([m.picked(columns(m)) for m in self.motions])
         return picked[self.moving[joint]]
 
 
 def table_of(urdf: str, recordings: Sequence[jaxid.Recording]) -> Table:
-    """The regression with the widths of the sign that leave least, one joint after the other."""
+    """The regression with the widths of the sign of smallest residual, joint by joint."""
     motions = tuple(Motion.of(urdf, r) for r in recordings)
     fastest = np.max([np.abs(m.v).max(axis=0) for m in motions], axis=0)
     scale = np.std(np.concatenate([m.tau for m in motions]), axis=0)
@@ -170,8 +170,8 @@ def table_of(urdf: str, recordings: Sequence[jaxid.Recording]) -> Table:
 def rigid_columns(motion: Motion, widths: np.ndarray) -> np.ndarray:
     """The linear model's columns along a motion, `(samples, joints, columns)`.
 
-    Ten parameters of every link, and of every joint the rotor, viscous and Coulomb friction, and a
-    delay of the torque to first order.
+    They are ten parameters for every link, and for every joint the rotor, viscous and Coulomb
+    friction, and a delay of the torque to first order.
     """
     slope = np.gradient(motion.tau, 1 / motion.rate, axis=0)
     own = np.stack([motion.a, motion.v, np.tanh(motion.v / widths), slope], axis=-1)
@@ -195,7 +195,7 @@ def _regressor(urdf: str, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.nda
 
 
 def solved(columns: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Least squares with columns of the same size, so that none is lost in rounding."""
+    """Least squares with normalised columns, against rounding errors."""
     size = np.linalg.norm(columns, axis=0)
     size = np.where(size > 0, size, 1.0)
     theta = np.linalg.lstsq(columns / size, right, rcond=1e-8)[0]
@@ -203,5 +203,5 @@ def solved(columns: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def residual(columns: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """What least squares leaves."""
+    """The residual of least squares."""
     return right - columns @ solved(columns, right)

@@ -1,8 +1,8 @@
-"""What people use to find what a rigid model lacks: each tool on the same rows.
+"""Other tools that find what a rigid model lacks, all on the same rows.
 
-A tool says which effects it found, if it can name any, whether it says that something is missing,
-and predicts torque along another motion. Choices are made on every third second of the recordings
-to fit, which are left out for that; the held-out recording judges and chooses nothing.
+A tool reports the effects that it found, if it can name effects, and whether something is missing.
+It predicts torque along another motion. Choices are made on every third second of the fitted
+recordings, which is left out of the fit. The held-out recording is used only for tests.
 """
 
 import warnings
@@ -16,22 +16,22 @@ from . import stepwise
 from ._baseline_library import Candidate, library
 from ._baseline_rows import Columns, Motion, Table, residual, rigid_columns, solved
 
-# A share of what is left that rows left out must lose before a tool says something is missing.
+# A tool reports that something is missing if it explains this share of the rows left out.
 WORTH = 0.05
-# A model with fewer terms is taken where it leaves at most this much more.
+# A model with fewer terms is preferred if its residual is at most this factor larger.
 AS_GOOD = 1.02
-# The share of an expression that the columns of one effect must explain to give it its name.
+# An expression gets an effect's name if the effect's columns explain this share of it.
 SAME = 0.8
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a tool found.
+    """The result of a tool.
 
     **Arguments:**
 
-    - `named`: effects and joints (from 1), the first the one that the tool found most important.
-    - `missing`: whether it says that the rigid model lacks something.
+    - `named`: effects and joints (from 1), the most important first.
+    - `missing`: whether it reports that the rigid model lacks something.
     - `predict`: torque along a motion, `(samples, joints)`.
     """
 
@@ -57,7 +57,7 @@ def stepwise_bic(table: Table, slides: tuple[bool, ...], seed: int) -> Found:
 
 
 def stepwise_validated(table: Table, slides: tuple[bool, ...], seed: int) -> Found:
-    """The same without the rows left out, ended where these are no better for more."""
+    """The same, stopped when the prediction of the rows left out does not improve."""
     candidates = library(table, slides)
     entered = _forward(table, candidates, ~table.left_out)
     blocks = [table.block(candidates[k].joint, candidates[k].columns) for k in entered]
@@ -69,8 +69,8 @@ def stepwise_validated(table: Table, slides: tuple[bool, ...], seed: int) -> Fou
 def pysindy_stlsq(table: Table, slides: tuple[bool, ...], seed: int) -> Found:
     """pysindy's sequentially thresholded least squares over the library's columns.
 
-    The rigid robot is taken out of library and torque first, so that thresholds are on what it
-    cannot explain; the threshold is chosen by the rows left out.
+    The rigid robot is projected out of library and torque first, so thresholds apply to the part
+    that it cannot explain. The threshold is chosen by the rows left out.
     """
     import pysindy
 
@@ -86,7 +86,7 @@ def pysindy_stlsq(table: Table, slides: tuple[bool, ...], seed: int) -> Found:
     for threshold in np.geomspace(0.05, 1.0, 12):
         optimizer = pysindy.STLSQ(threshold=float(threshold), alpha=1e-3, max_iter=50)
         with warnings.catch_warnings():
-            # That nothing is left of a threshold is one of the answers.
+            # A threshold may remove all terms; this is a valid answer.
             warnings.simplefilter("ignore")
             optimizer.fit(columns, right[:, None])
         found = np.abs(np.asarray(optimizer.coef_)[0]) > 0
@@ -99,10 +99,10 @@ def pysindy_stlsq(table: Table, slides: tuple[bool, ...], seed: int) -> Found:
 
 
 def gplearn_symbolic(table: Table, slides: tuple[bool, ...], seed: int) -> Found:
-    """gplearn's expressions for what the rigid robot leaves of each joint's torque.
+    """gplearn's expressions for the rigid robot's residual torque of each joint.
 
-    An expression has the name of the effect whose columns explain most of its values, if that is
-    enough of them; it is kept where the rows left out are better for it.
+    An expression gets the name of the effect whose columns explain the largest part of its values,
+    if that part is large enough. It is kept if it improves the prediction of the rows left out.
     """
     from gplearn.functions import make_function
     from gplearn.genetic import SymbolicRegressor
@@ -137,7 +137,7 @@ def gplearn_symbolic(table: Table, slides: tuple[bool, ...], seed: int) -> Found
 
 
 def gaussian_process(table: Table, slides: tuple[bool, ...], seed: int) -> Found:
-    """scikit-learn's Gaussian process on what the rigid robot leaves; it cannot name."""
+    """scikit-learn's Gaussian process on the rigid robot's residual; it cannot name effects."""
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
@@ -146,7 +146,7 @@ def gaussian_process(table: Table, slides: tuple[bool, ...], seed: int) -> Found
         kernel = ConstantKernel(0.5) * RBF(np.ones(x.shape[1]), (1e-2, 1e3)) + WhiteKernel(0.5)
         process = GaussianProcessRegressor(kernel, random_state=seed % 2**31)
         with warnings.catch_warnings():
-            # A length at its bound is a signal that does not matter.
+            # A length at its bound belongs to an irrelevant signal.
             warnings.simplefilter("ignore")
             return process.fit(x[few], y[few])
 
@@ -154,7 +154,7 @@ def gaussian_process(table: Table, slides: tuple[bool, ...], seed: int) -> Found
 
 
 def network(table: Table, slides: tuple[bool, ...], seed: int) -> Found:
-    """scikit-learn's network of two layers on what the rigid robot leaves; it cannot name."""
+    """scikit-learn's two-layer network on the rigid robot's residual; it cannot name effects."""
     from sklearn.neural_network import MLPRegressor
 
     def fitted(x: np.ndarray, y: np.ndarray) -> Any:
@@ -185,7 +185,7 @@ def _fade(x: np.ndarray) -> np.ndarray:
 
 
 def _forward(table: Table, candidates: Sequence[Candidate], kept: np.ndarray) -> list[int]:
-    """Places of the candidates that enter by the rows that are kept."""
+    """Places of the candidates that are selected by the rows that are kept."""
     blocks = [table.block(c.joint, c.columns)[kept] for c in candidates]
     keys: list[stepwise.Key] = [(c.family, c.joint) for c in candidates]
     rows = stepwise.Rows(table.base[kept], blocks, keys, table.right[kept])
@@ -193,7 +193,7 @@ def _forward(table: Table, candidates: Sequence[Candidate], kept: np.ndarray) ->
 
 
 def _left(table: Table, blocks: Sequence[np.ndarray]) -> float:
-    """The squared error of the rows that are left out of a fit."""
+    """The squared error of the rows left out of a fit."""
     columns, out = np.concatenate([table.base, *blocks], axis=1), table.left_out
     theta = solved(columns[~out], table.right[~out])
     return float(np.sum((table.right[out] - columns[out] @ theta) ** 2))
@@ -227,7 +227,7 @@ def _with_blocks(table: Table, chosen: Sequence[Candidate]) -> Found:
 def _called(
     table: Table, term: Candidate, candidates: Sequence[Candidate]
 ) -> tuple[str, int] | None:
-    """The effect whose columns explain an expression beside the rigid robot; None for none."""
+    """The effect whose columns explain an expression, after the rigid robot; None for none."""
     value = residual(table.base, table.block(term.joint, term.columns)[:, 0])
     best, share = None, SAME
     for candidate in (c for c in candidates if c.joint == term.joint):
@@ -239,7 +239,7 @@ def _called(
 
 
 def _signals(table: Table, joint: int, motions: Sequence[Motion]) -> Columns:
-    """What a learner sees of a motion, each signal about as large as one; angles in rad."""
+    """A learner's inputs along a motion, scaled to about one; angles in rad."""
     fastest = np.max([np.abs(m.v).max(axis=0) for m in motions], axis=0)
     hardest = max(float(np.abs(table.load(m)[:, joint]).max()) for m in motions)
     lasts = max(float(m.time[-1] - m.time[0]) for m in motions)
@@ -264,7 +264,7 @@ def _explained(y: np.ndarray, predicted: np.ndarray) -> float:
 
 
 def _learned(table: Table, fitted: Callable[[np.ndarray, np.ndarray], Any]) -> Found:
-    """A learner for each joint on what the rigid robot leaves; kept where it is worth it."""
+    """A learner for each joint on the rigid robot's residual, kept if it explains enough."""
     rest = residual(table.base, table.right)
     plain = _with_blocks(table, [])
     kept: list[tuple[int, Any, Columns]] = []

@@ -1,4 +1,4 @@
-"""The SCARA of Brunot et al. 2016 with noise like theirs, from the independent simulator."""
+"""The SCARA of Brunot et al. 2016 with similar noise, from the independent simulator."""
 
 import sys
 from collections.abc import Sequence
@@ -30,10 +30,10 @@ SAMPLES = 2001
 
 
 def polynomial(order: int, seed: int) -> np.ndarray:
-    """A stable AR polynomial of that order, with noise some sixty times its innovation's variance.
+    """A stable AR polynomial; the noise has about sixty times the variance of its innovation.
 
-    The paper prints orders and deviations only. Its ratio of 9.7 to 10 between the deviations of
-    OEM and PEM is, by its formulas, the root of that factor; here it comes to 8.
+    The paper prints orders and deviations only. By its formulas, its ratio of 9.7 to 10 between the
+    deviations of OEM and PEM is the square root of that factor; here it is 8.
     """
     rng = np.random.default_rng(seed)
     reflection = 0.12 * rng.uniform(-1, 1, order)
@@ -50,7 +50,7 @@ AR = tuple(polynomial(order, seed) for order, seed in zip(ORDERS, (1, 2), strict
 
 @dataclass(frozen=True)
 class Motion:
-    """One noise-free run: what the simulator gave, and the reference it followed."""
+    """One noise-free run: the simulated signals, and the reference."""
 
     name: str
     reference: sim.MultiSine

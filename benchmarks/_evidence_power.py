@@ -1,4 +1,4 @@
-"""Power curves: how often an effect is named, over how much of it the rigid robot leaves."""
+"""Power curves: share of named effects over the size that the rigid robot cannot absorb."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from jaxid.display import figures
 
 from ._evidence_tables import NAMELESS, Line, interval, share
 
-# Bounds of the size of what is left of an effect's torque, in units of the noise.
+# Bounds of the size of an effect's residual torque, in units of the noise.
 SIZES = (0.0, 1.0, 2.0, 4.0, 8.0, float("inf"))
 DASHES = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
 MARKERS = ("circle", "square", "diamond", "triangle-up", "cross", "x")
@@ -21,7 +21,7 @@ MARKERS = ("circle", "square", "diamond", "triangle-up", "cross", "x")
 
 @dataclass(frozen=True)
 class Trial:
-    """One effect, or one case, that a tool was given: its size over the noise, and the answer."""
+    """One effect or case given to a tool: its size over the noise, and the answer."""
 
     tool: str
     size: float
@@ -29,7 +29,7 @@ class Trial:
 
 
 def sizes(lines: Iterable[Line]) -> dict[int, list[float]]:
-    """What the rigid robot leaves of each effect, by the case's seed; the baselines measure it."""
+    """Residual size of each effect, by the case's seed; the baselines measure it."""
     return {x["seed"]: x["visible"] for x in lines if "visible" in x}
 
 
@@ -44,7 +44,7 @@ def named(lines: Sequence[Line]) -> list[Trial]:
 
 
 def alone(lines: Sequence[Line]) -> list[Trial]:
-    """Each case, by its smallest effect, and whether all of it was named and nothing else."""
+    """Each case, by its smallest effect, and whether exactly its effects were named."""
     known = sizes(lines)
     return [
         Trial(x["tool"], min(known[x["seed"]]), x["marks"]["right"] and not x["marks"]["extra"])
@@ -69,7 +69,7 @@ def _within(trials: Sequence[Trial], low: float, high: float) -> list[Trial]:
 
 
 def power_table(trials: Sequence[Trial]) -> pd.DataFrame:
-    """Right of all by size, with a column for each tool."""
+    """Number of correct answers by size, with a column for each tool."""
     rows = {}
     for low, high in pairwise(SIZES):
         label = f"above {low:g}" if np.isinf(high) else f"{low:g} to {high:g}"
@@ -91,7 +91,7 @@ def power_figure(lines: Sequence[Line]) -> go.Figure:
         for k, tool in enumerate(tools):
             own = [t for t in trials if t.tool == tool]
             groups = [g for low, high in pairwise(SIZES) if (g := _within(own, low, high))]
-            # Tools side by side, so that their intervals do not hide each other.
+            # Tools are drawn side by side, so their intervals do not overlap.
             shift = 1.03 ** (k - len(tools) / 2)
             x = [shift * float(np.exp(np.mean([np.log(t.size) for t in g]))) for g in groups]
             right = [sum(t.right for t in g) for g in groups]

@@ -1,4 +1,4 @@
-"""Tables of the lines of result files: scores by tool, by world, and of claimed probabilities."""
+"""Tables from result files: scores by tool and by world, and calibration of probabilities."""
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
@@ -10,9 +10,9 @@ from scipy import stats
 
 Line = dict[str, Any]
 Count = tuple[int, int]
-# Tools whose answer has no names in it.
+# Tools that do not name effects.
 NAMELESS = ("rigid", "Gaussian process", "network")
-# Bounds of the probabilities that a discovery gives to what it adds.
+# Bounds of the probabilities of added effects.
 CLAIMS = (0.0, 0.5, 0.7, 0.9, 0.99, 1.0)
 WORLDS = ("friction", "noise", "robot", "law")
 
@@ -24,7 +24,7 @@ def interval(right: int, of: int) -> tuple[float, float]:
 
 
 def share(count: Count) -> str:
-    """A share with its 95 % interval, as tables have it."""
+    """A share with its 95 % interval, as text."""
     right, of = count
     if of == 0:
         return "–"
@@ -33,7 +33,7 @@ def share(count: Count) -> str:
 
 
 def counts(lines: Sequence[Line]) -> dict[str, Count]:
-    """What was right, of how many, of one tool's lines; errors count as wrong."""
+    """Numbers of correct answers and of cases in one tool's lines; errors count as wrong."""
     of = {k: [x for x in lines if x["kind"] == k] for k in ("single", "double", "clean", "outside")}
     effects = [*of["single"], *of["double"]]
     named = [n for x in effects for n in x.get("marks", {}).get("named", [False] * _size(x))]
@@ -80,7 +80,7 @@ def _cell(tool: str, name: str, count: Count) -> str:
 
 
 def _verdicts(lines: Sequence[Line]) -> dict[str, str]:
-    """What only a tool with verdicts and probabilities can be asked for."""
+    """Scores that only a tool with verdicts and probabilities has."""
     done = [x for x in lines if "marks" in x]
     effects = [x for x in done if x["kind"] in ("single", "double")]
     sure = [x["marks"]["ratio"] for x in done if x["marks"]["sure"]]
@@ -110,7 +110,7 @@ def _true(line: Line) -> list[tuple[str, int]]:
 
 
 def _group(added: dict[str, Any]) -> list[tuple[str, int | None]]:
-    """An addition, and what it could not be told from."""
+    """An added effect with its indistinguishable alternatives."""
     return [(e["effect"], e["joint"]) for e in (added, *added["indistinguishable"])]
 
 
@@ -120,7 +120,7 @@ def by_tool(lines: Iterable[Line]) -> pd.DataFrame:
 
 
 def by_world(lines: Iterable[Line], world: str) -> pd.DataFrame:
-    """Scores of one tool's lines, with a column for each value of what the worlds differ in."""
+    """Scores of one tool's lines, with a column for each value of a property of the worlds."""
     return _grouped(list(lines), lambda x: x[world])
 
 
@@ -130,9 +130,9 @@ def _grouped(lines: Sequence[Line], key: Callable[[Line], str]) -> pd.DataFrame:
 
 
 def calibration(lines: Iterable[Line]) -> pd.DataFrame:
-    """Of effects added with some probability, how many are there.
+    """Share of added effects that were hidden, by their probability.
 
-    There is an effect that was hidden; in its group, one that shares the weight with it was.
+    An effect also counts as in its group if one that shares the weight with it was hidden.
     """
     claims: list[tuple[float, bool, bool]] = []
     for line in lines:
@@ -144,7 +144,7 @@ def calibration(lines: Iterable[Line]) -> pd.DataFrame:
     rows = {}
     for low, high in pairwise(CLAIMS):
         last = high == CLAIMS[-1]
-        # Upper bounds belong to the next row, but for certainty.
+        # Upper bounds belong to the next row, except a probability of one.
         within = [c for c in claims if low <= c[0] < high or (last and c[0] >= high)]
         label = (
             f"above {low:g}" if last else f"below {high:g}" if low == 0 else f"{low:g} to {high:g}"

@@ -1,4 +1,4 @@
-"""Measurements that need a process of their own: first calls, and peaks of memory."""
+"""Measurements that need a separate process: first calls, and peaks of memory."""
 
 import multiprocessing
 import time
@@ -19,8 +19,8 @@ def each_afresh(
 
     **Arguments:**
 
-    - `fun`: of a module, so that another process finds it by its name.
-    - `at_once`: how many processes; more than one where times do not matter.
+    - `fun`: a function of a module, which another process finds by its name.
+    - `at_once`: number of processes; more than one only if times do not matter.
     """
     context = multiprocessing.get_context("spawn")
     with context.Pool(at_once, _without_cache, maxtasksperchild=1) as pool:
@@ -28,12 +28,12 @@ def each_afresh(
 
 
 def _without_cache() -> None:
-    # A program that another process has compiled would make the first call a second one.
+    # Otherwise the first call could use a program that another process has compiled.
     jax.config.update("jax_enable_compilation_cache", False)
 
 
 def cold_and_warm(fun: Callable[[], Any], repeats: int) -> tuple[Any, float, float]:
-    """What a function gives, seconds of its first call, and of the shortest of more calls."""
+    """The result of a function, seconds of its first call, and of the shortest later call."""
     found, cold = _timed(fun)
     return found, cold, min(_timed(fun)[1] for _ in range(repeats))
 
@@ -45,9 +45,9 @@ def _timed(fun: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def peak_memory() -> float:
-    """Largest resident memory of this process so far, MiB; not a number where Linux is not.
+    """Largest resident memory of this process so far, MiB; NaN if the system is not Linux.
 
-    The peak in `getrusage` would not do: a process inherits that of the one that started it.
+    The peak in `getrusage` is not usable, because a process inherits that of its parent.
     """
     status = Path("/proc/self/status")
     lines = status.read_text().splitlines() if status.exists() else []

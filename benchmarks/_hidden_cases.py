@@ -1,4 +1,4 @@
-"""Which cases the blind bench has: robots, effects and noise drawn from one seed."""
+"""Cases of the benchmark of hidden effects: robots, effects and noise drawn from one seed."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,9 +18,9 @@ TRANSMISSIONS = {"joint_elasticity", "backlash"}
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a case is to be: its place in the bench, its seed, the effects' names, the noise.
+    """Specification of a case: its number, its seed, the effects' names, the noise.
 
-    `law` is what the user knows of the controller: "known" or "unknown".
+    `law`: whether the user knows the controller, "known" or "unknown".
     """
 
     number: int
@@ -33,16 +33,16 @@ class Wanted:
 
     @property
     def label(self) -> str:
-        """For file names and tables."""
+        """Name in files and tables."""
         return f"{self.number:03d}_{self.kind}_{'+'.join(self.effects) or self.noise}"
 
 
 def draw_wanted(
     master: int, quick: bool = False, robot: str = "scara", law: str = "known"
 ) -> list[Wanted]:
-    """The cases of one run, shuffled, so that a part of them says something of all.
+    """The cases of one run in random order, so a part of them represents all.
 
-    With "any" robot, each case has one drawn from those on which its effects make sense.
+    With "any" robot, each case has a random robot on which its effects make sense.
     """
     rng = np.random.default_rng(master)
     robots = ROBOTS if robot == "any" else (robot,)
@@ -59,7 +59,7 @@ def draw_wanted(
         again = rng.choice(strange, 5, replace=False).tolist()
         plain += [("outside", (name,)) for name in (*strange, *again)]
     colours = rng.choice(COLOURS, len(plain)).tolist()
-    # Half of the clean cases in strongly coloured noise: there false alarms are born.
+    # Half of the clean cases have strongly coloured noise, in which false alarms are most likely.
     clean = [k for k, (kind, _) in enumerate(plain) if kind == "clean"]
     for turn, k in enumerate(clean):
         colours[k] = "strong" if turn % 2 == 0 else str(rng.choice(COLOURS[:2]))
@@ -86,7 +86,7 @@ def _robot(rng: np.random.Generator, robots: Sequence[str], names: Sequence[str]
 
 
 def _pair(rng: np.random.Generator, known: Sequence[str]) -> tuple[str, ...]:
-    """Two names that can be on one robot, wherever they are put."""
+    """Two names that can be on one robot, on any joints."""
     while True:
         names = tuple(rng.choice(known, 2, replace=False).tolist())
         if not set(names) <= TRANSMISSIONS:
@@ -99,7 +99,7 @@ def build(wanted: Wanted) -> sim.Case:
 
 
 def start_model(case: sim.Case, law: str = "known") -> jaxid.ClosedLoop:
-    """The model that a user would start from: the robot under its controller, without effects."""
+    """The starting model of a user: the robot under its controller, without effects."""
     if law == "unknown":
         return dataclasses.replace(start_model(case), controller=jaxid.control.Tracking())
     if case.robot == "scara":
@@ -112,7 +112,7 @@ def start_model(case: sim.Case, law: str = "known") -> jaxid.ClosedLoop:
 
 
 def read_case(folder: Path, case: sim.Case) -> tuple[jaxid.Recordings, jaxid.Recordings]:
-    """The case as a user has it: CSV files, written and read; to fit and held out."""
+    """The recordings of a case, written to CSV files and read: to fit, and held out."""
     sim.write_case(folder, case)
     fitting = jaxid.read(folder / "fit_1.csv", folder / "fit_2.csv")
     return jaxid.Recordings.of(fitting), jaxid.Recordings.of(jaxid.read(folder / "held_out.csv"))

@@ -1,4 +1,4 @@
-"""What was right of a story, case by case and over all of them."""
+"""Marks of a discovery, by case and in total."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -11,12 +11,12 @@ from tests import independent as sim
 from ._hidden_cases import KINDS
 from ._hidden_truth import Key, same, true_key
 
-# Beyond this chance of noise alone, the recordings do not show an effect.
+# An effect is invisible if its p-value is above this value.
 INVISIBLE = 0.01
 
 
 def groups(story: dict[str, Any]) -> list[list[Key]]:
-    """Each added effect with what it could not be told from."""
+    """Each added effect with its indistinguishable alternatives."""
     return [
         [(a["effect"], a["joint"])] + [(i["effect"], i["joint"]) for i in a["indistinguishable"]]
         for a in story["added"]
@@ -24,7 +24,7 @@ def groups(story: dict[str, Any]) -> list[list[Key]]:
 
 
 def expected_place(effect: Any) -> tuple[str, int]:
-    """On which coordinate, of which joint's torque, an effect outside the catalogue depends."""
+    """The coordinate and joint of an effect outside the catalogue."""
     j = effect.joint
     coordinate = {
         "torque_bump": f"q{j}",
@@ -41,11 +41,11 @@ def expected_place(effect: Any) -> tuple[str, int]:
 def judge(
     case: sim.Case, kind: str, story: dict[str, Any], floor: Sequence[float] | None = None
 ) -> dict[str, Any]:
-    """What was right of a story.
+    """The marks of a story.
 
     **Arguments:**
 
-    - `floor`: what noise leaves of the held-out recording, %, where it is compared in a band.
+    - `floor`: error of the held-out recording due to noise, %, if it is compared in a band.
     """
     found, true = groups(story), [true_key(e) for e in case.effects]
     floor = case.recordings["held_out"]["noise_floor_percent"] if floor is None else floor
@@ -70,7 +70,7 @@ def judge(
 
 
 def failed(kind: str, marks: dict[str, Any]) -> bool:
-    """Whether a case deserves a look."""
+    """Whether a case should be examined."""
     if kind == "clean":
         return marks["alarm"]
     if kind == "outside":
@@ -120,7 +120,7 @@ def invisible(record: dict[str, Any], place: int = 0) -> bool:
 
 
 def summary(records: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """Scores, with the aims beside them: (right, of, aim)."""
+    """Scores with their goals: (right, of, aim)."""
     done = [r for r in records if "marks" in r]
     of = {kind: [r for r in done if r["kind"] == kind] for kind in KINDS}
     seen = [r for r in of["single"] if not invisible(r)]
@@ -191,7 +191,7 @@ def _by_noise(chi: dict[str, float]) -> str:
 
 
 def show_failure(record: dict[str, Any]) -> None:
-    """Prints what a case was, what was found, and what an oracle finds."""
+    """Prints the truth of a case, the result, and the result of an oracle."""
     print(
         f"\n{record['number']} {record['kind']}, seed {record['seed']}, {record['robot']}, "
         f"noise {record['noise']}"

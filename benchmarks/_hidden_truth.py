@@ -1,4 +1,4 @@
-"""The truth of a case in jaxid's terms, and what who knows it can prove."""
+"""The truth of a case as a model of jaxid, and the evidence for it from the recordings."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -27,7 +27,7 @@ def same(found: Key, true: Key) -> bool:
 
 
 def in_jaxid(effect: Any, plant: Any) -> fx.AbstractEffect:
-    """The simulator's effect as an effect of jaxid, at the same values as far as they share them.
+    """The simulator's effect as an effect of jaxid, with the values of common parameters.
 
     **Raises:** `ValueError` for effects outside the catalogue.
     """
@@ -93,11 +93,11 @@ def in_jaxid(effect: Any, plant: Any) -> fx.AbstractEffect:
 
 
 def innovations(case: sim.Case, names: Sequence[str], errors: Sequence[np.ndarray]) -> float:
-    """Squared residuals whitened by the noise filter that made the noise: the truth's chi squared.
+    """Squared residuals whitened by the true noise filter: the chi squared of the truth.
 
     **Arguments:**
 
-    - `names`: of the case's recordings. `errors`: `(samples, joints)` for each of them.
+    - `names`: of the case's recordings. `errors`: `(samples, joints)` for each recording.
     """
     total = 0.0
     for name, error in zip(names, errors, strict=True):
@@ -111,7 +111,7 @@ def innovations(case: sim.Case, names: Sequence[str], errors: Sequence[np.ndarra
 
 
 def chi_squared(case: sim.Case, fit: jaxid.Fit, held_out: jaxid.Recordings) -> dict[str, float]:
-    """How well a fit does by the true noise, on fitted and on held-out recordings."""
+    """Chi squared of a fit by the true noise, on fitted and on held-out recordings."""
     found = innovations(case, list(fit.recordings.names), fit.residuals)
     unseen = jaxid.compare(fit, held_out).residuals
     return {
@@ -122,10 +122,10 @@ def chi_squared(case: sim.Case, fit: jaxid.Fit, held_out: jaxid.Recordings) -> d
 
 
 def oracle(case: sim.Case, without: Sequence[int], fitting: jaxid.Recordings) -> jaxid.Fit:
-    """The fit of who knows the truth: its effects but some, from its values."""
+    """The fit of an oracle: the true effects without some, started at the true values."""
     keep = [e for k, e in enumerate(case.effects) if k not in without]
     loop = start_model(case)
-    # The one joint of an axis has friction without a number in its plant, and with one in the loop.
+    # The friction of an axis has no joint number in the plant, but it has one in the loop.
     base = {
         name if name in loop.names else f"{name}1": getattr(case.plant, name)
         for name in case.plant.base
@@ -137,10 +137,10 @@ def oracle(case: sim.Case, without: Sequence[int], fitting: jaxid.Recordings) ->
 def visible(
     case: sim.Case, fitting: jaxid.Recordings, held_out: jaxid.Recordings, base: jaxid.Fit
 ) -> dict[str, Any]:
-    """Whether who knows each true effect can prove it on the fitted recordings.
+    """Whether an oracle can prove each true effect on the fitted recordings.
 
-    **Returns:** the oracle's chi squared, and for each effect what it takes away beside the
-    others, with its p-value.
+    **Returns:** the oracle's chi squared, and for each effect its decrease in addition to the
+    others, with the p-value.
     """
     full = oracle(case, (), fitting)
     best = chi_squared(case, full, held_out)

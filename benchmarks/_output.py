@@ -1,4 +1,4 @@
-"""What every benchmark script shares: its two options, and where tables go."""
+"""Common parts of all benchmark scripts: the two options, and the output of tables."""
 
 import argparse
 import json
@@ -17,7 +17,7 @@ def options(description: str | None) -> argparse.Namespace:
 
 
 def report(table: pd.DataFrame, json_file: Path | None, form: str = ".3f") -> None:
-    """Prints a table, and writes it as JSON records where a file is named."""
+    """Prints a table, and writes it as JSON records if a file is given."""
     show(table, form)
     write(records(table), json_file)
 
@@ -28,11 +28,11 @@ def show(table: pd.DataFrame, form: str = ".3f") -> None:
 
 
 def records(table: pd.DataFrame, **more: str) -> list[dict[str, Any]]:
-    """The rows of a table with their index, and what else is to stand in each."""
+    """The rows of a table with their index, and further values for each."""
     return [{**more, **row} for row in table.reset_index().to_dict(orient="records")]
 
 
 def write(rows: list[dict[str, Any]], json_file: Path | None) -> None:
-    """Writes rows as JSON where a file is named."""
+    """Writes rows as JSON if a file is given."""
     if json_file is not None:
         json_file.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n")

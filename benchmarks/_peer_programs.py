@@ -42,14 +42,14 @@ class Peer:
 
 
 def of_jaxid(recs: jaxid.Recordings, alone: bool = False) -> Peer:
-    """What a fit of jaxid repeats: weighted residual, Jacobian and normal equations.
+    """The repeated part of a fit by jaxid: weighted residual, Jacobian and normal equations.
 
-    On all cores, which share recordings, or on one alone.
+    On all cores, over which recordings are distributed, or on one core.
     """
     started = time.perf_counter()
     loop = cad()
     batch = prepare(loop, recs)
-    # Simulated less measured, so that its derivative is the torque's.
+    # Simulated minus measured, so its derivative is that of the torque.
     asked = dataclasses.replace(problem(loop, batch), weights=-jnp.ones(2))
     start = jnp.concatenate([batch.q0, batch.v0], axis=1)
     around = functools.partial(point_around, asked) if alone else linearisation(asked)
@@ -107,7 +107,7 @@ def of_c(recs: jaxid.Recordings) -> Peer | None:
 
 
 def physics(np_, p, c, t, x):
-    """Torque and rate of the loop, in the functions of `np_`, for peers that call Python."""
+    """Torque and rate of the loop, by the functions of `np_`, for peers that call Python."""
     reference = [c[j] + t * (c[2 + j] + t * (c[4 + j] + t * c[6 + j])) for j in range(2)]
     tau = [KG[j] * (KP[j] * (reference[j] - x[j]) - KV[j] * x[2 + j]) for j in range(2)]
     v1, v2, cs, sn = x[2], x[3], np_.cos(x[1]), np_.sin(x[1])
@@ -203,7 +203,7 @@ def differences(simulate: Callable[[np.ndarray], Any]) -> Callable[[np.ndarray],
 
 
 def of_scipy(recs: jaxid.Recordings) -> Peer:
-    """`solve_ivp` at the tolerance that gives the accuracy of the fixed steps, and differences."""
+    """`solve_ivp` with the accuracy of the fixed steps, and differences."""
     data = arrays(recs)
 
     def simulate(theta):
@@ -229,7 +229,7 @@ def of_scipy(recs: jaxid.Recordings) -> Peer:
 
 
 def sampling(d: dict[str, np.ndarray]) -> float:
-    """Largest step, s: the arctan at standstill is narrower than a solver's own guess."""
+    """Largest step, s; the solver's own choice would be too large for the arctan at standstill."""
     return float(d["time"][1] - d["time"][0])
 
 
@@ -255,7 +255,7 @@ MODEL = """
 
 
 def of_mujoco(recs: jaxid.Recordings) -> Peer | None:
-    """MuJoCo's RK4, in as many threads as there are cores, as its sysid toolbox runs it."""
+    """MuJoCo's RK4 with one thread per core, as in its sysid toolbox."""
     try:
         import mujoco
         from mujoco import rollout

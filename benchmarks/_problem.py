@@ -1,4 +1,4 @@
-"""The fit that all speed benchmarks share, and how they time it."""
+"""The fit of all speed benchmarks, and its timing."""
 
 import platform
 import time
@@ -19,7 +19,7 @@ from jaxid.simulation.steps import set_substeps
 
 SUBSTEPS = 4
 PERIOD = 0.01
-# Brunot et al. 2016: what their separable PEM found for the SCARA.
+# Estimates of separable PEM for the SCARA, Brunot et al. 2016.
 TRUTH = {
     "ZZ1r": 3.45,
     "ZZ2": 0.062,
@@ -34,7 +34,7 @@ NOISE = 0.02
 
 
 def cad() -> jaxid.ClosedLoop:
-    """The loop at its CAD start, with as many steps between samples as all peers take."""
+    """The loop at its CAD start, with the same steps between samples as all peers."""
     return set_substeps(jaxid.scara(), SUBSTEPS)
 
 
@@ -56,7 +56,7 @@ def recordings(
         rate, phase = rng.uniform(0.5, 4.0, (5, 2)), rng.uniform(0, 2 * np.pi, (5, 2))
         size = np.array([0.5, 0.9]) / 5**0.5
         q_ref = fade * np.sum(size * np.sin(time_[:, None, None] * rate + phase), axis=1)
-        # Only its reference and its start are used: what stands for the torque is overwritten.
+        # Only its reference and its start are used; the torque is overwritten.
         bare.append(jaxid.Recording.from_arrays(time_, q_ref, q_ref, q_ref=q_ref, name=f"r{k}"))
     runs = simulate(truth(), jaxid.Recordings.of(bare))
     return jaxid.Recordings.of(
@@ -74,7 +74,7 @@ def recordings(
 
 
 def problem(loop: jaxid.ClosedLoop, batch: Batch, mesh: jax.sharding.Mesh | None = None) -> Problem:
-    """What `OEM` minimises in it, with white noise and starts at rest."""
+    """The problem that `OEM` minimises, with white noise and starts at rest."""
     bounds, count = Bounds.of(loop.free_parameters), batch.q0.shape[0]
     white = jnp.zeros((2, 16)).at[:, 0].set(1.0)
     ends = bounds.lower, bounds.upper
@@ -83,7 +83,7 @@ def problem(loop: jaxid.ClosedLoop, batch: Batch, mesh: jax.sharding.Mesh | None
 
 
 def arrays(recs: jaxid.Recordings) -> list[dict[str, np.ndarray]]:
-    """What peers need of each recording: lengths of intervals, cubics, start, torque."""
+    """Data of each recording for peers: lengths of intervals, cubics, start, torque."""
     batch = prepare(cad(), recs)
     return [
         {
@@ -107,12 +107,12 @@ def once(fun: Callable[[], Any]) -> float:
 def interleaved(
     funs: dict[str, Callable[[], Any]], budget: float, most: int = 200
 ) -> dict[str, float]:
-    """Shortest of many calls of each, taken in turns so that other load meets all alike, s.
+    """Shortest of many calls of each function, in turns, so other load affects all equally, s.
 
     **Arguments:**
 
-    - `budget`: seconds for all together; each is called twice at least.
-    - `most`: largest number of calls of each.
+    - `budget`: seconds for all functions together; each is called at least twice.
+    - `most`: largest number of calls of each function.
     """
     best = dict.fromkeys(funs, np.inf)
     started = time.perf_counter()

@@ -1,6 +1,6 @@
 """Arms of six and seven joints from published URDFs, simulated by MuJoCo under a sampled law.
 
-MuJoCo reads the URDF itself; none of this knows jaxid's formulas.
+MuJoCo reads the URDF; jaxid's formulas are not used.
 """
 
 import math
@@ -28,7 +28,7 @@ STEP = TICK / STEPS
 
 
 def folder() -> Path:
-    """Where the package has its robots."""
+    """The folder of the package's robots."""
     import example_robot_data
 
     start = Path(example_robot_data.__file__)
@@ -39,7 +39,7 @@ def folder() -> Path:
 
 
 def arm_alone(name: str) -> tuple[ET.Element, str]:
-    """The robot's URDF without pictures, its fingers fixed; and the last link of the arm."""
+    """The robot's URDF without meshes, with fixed fingers, and the last link of the arm."""
     path, tip = ROBOTS[name]
     root = ET.parse(folder() / path).getroot()
     for link in root.findall("link"):
@@ -71,7 +71,7 @@ def _of(joint: ET.Element, what: str) -> str:
 
 
 def text(root: ET.Element) -> str:
-    """A URDF as MuJoCo and jaxid read it."""
+    """A URDF as text, which MuJoCo and jaxid can read."""
     return ET.tostring(root, encoding="unicode")
 
 
@@ -92,7 +92,7 @@ def with_payload(root: ET.Element, tip: str, mass: float, centre: Sequence[float
 
 
 def with_wrong_bodies(root: ET.Element, rng: np.random.Generator, most: float) -> ET.Element:
-    """The URDF as somebody drew it: masses, and inertias with them, off by up to a share."""
+    """The URDF with wrong masses, and inertias in proportion, by up to a share."""
     drawn = ET.fromstring(ET.tostring(root))
     for body in drawn.iter("inertial"):
         factor = float(rng.uniform(1 - most, 1 + most))
@@ -105,7 +105,7 @@ def with_wrong_bodies(root: ET.Element, rng: np.random.Generator, most: float) -
 
 @dataclass
 class Plant:
-    """The arm as it is: bodies in MuJoCo's model, and torques on its drives beside them.
+    """The true arm: bodies in MuJoCo's model, and further torques on its drives.
 
     - `rotors`: inertia of each drive at its joint, kg·m².
     - `extra`: torques that the user's model lacks: name, joint (from 0), numbers.
@@ -128,7 +128,7 @@ class Plant:
         dry = [f.coulomb if f.family == "dry" else 0.0 for f in self.frictions]
         model.dof_frictionloss[:] = dry
         roll, pitch = self.tilt
-        # The base turned about its x axis, then about its y axis: gravity the other way.
+        # The base is turned about its x axis, then about its y axis; gravity turns the other way.
         down = np.array([math.sin(pitch), -math.sin(roll) * math.cos(pitch), 0.0])
         down[2] = -math.sqrt(1.0 - down @ down)
         model.opt.gravity[:] = 9.81 * down
@@ -137,9 +137,9 @@ class Plant:
     def unseen(
         self, q: Sequence[float], v: Sequence[float], through: Sequence[float]
     ) -> list[float]:
-        """What takes torque beside the bodies and the known friction, by joint, N·m.
+        """Torque in addition to that of the bodies and the known friction, by joint, N·m.
 
-        `through` is what each gear passed on to its link a step ago.
+        `through` is the torque that each gear transmitted to its link one step before.
         """
         taken = [0.0] * len(q)
         for name, j, d in self.extra:
@@ -167,7 +167,7 @@ class Plant:
             case "torque_ripple":
                 return math.sin(d["harmonic"] * q + d["phase"])
             case "counterbalance":
-                # A gas cylinder between two points: its pressure falls as it opens.
+                # A gas cylinder between two points, whose pressure decreases as it opens.
                 turned = q - d["angle"]
                 length = math.sqrt(1 + d["ratio"] ** 2 - 2 * d["ratio"] * math.cos(turned))
                 force = 1.0 - d["gas"] * (length - 1.0)
@@ -183,7 +183,7 @@ def bare(urdf: str) -> Plant:
 
 @dataclass(frozen=True)
 class Run:
-    """At 1 kHz, `(ticks, joints)`: encoders, commanded torque, and what the hidden effects took."""
+    """At 1 kHz, `(ticks, joints)`: encoders, commanded torque, and torque of the hidden effects."""
 
     time: np.ndarray
     q: np.ndarray
@@ -207,7 +207,7 @@ def simulate(
     n = model.nv
     m = inertias(model, data)
     kp, kd, ki = m * bandwidth**2, 1.4 * m * bandwidth, 0.3 * m * bandwidth**3
-    # It begins with what holds the arm.
+    # It begins with the torque that holds the arm.
     integral = np.array(data.qfrc_bias) / ki
     before, speed = np.round(home / resolution) * resolution, np.zeros(n)
     smooth = 1.0 - math.exp(-2 * math.pi * 150.0 * TICK)
@@ -241,7 +241,7 @@ def simulate(
 
 
 def inertias(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Diagonal of the mass matrix where the arm is, `(joints,)`."""
+    """Diagonal of the mass matrix at the current pose, `(joints,)`."""
     full = np.zeros((model.nv, model.nv))
     for row, unit in zip(full, np.eye(model.nv), strict=True):
         mujoco.mj_mulM(model, data, row, unit)
@@ -249,7 +249,7 @@ def inertias(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def limits(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Of the joints, rad; of one that may turn for ever half a turn either way."""
+    """Limits of the joints, rad; half a turn in both directions for an unlimited joint."""
     low, high = model.jnt_range.T
     free = high <= low
     low, high = np.where(free, -np.pi, low), np.where(free, np.pi, high)
@@ -257,7 +257,7 @@ def limits(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def torques(plant: Plant, reference: Reference, home: np.ndarray, duration: float) -> np.ndarray:
-    """What the motion that is asked for takes of rigid bodies and rotors, `(samples, joints)`."""
+    """Torque of rigid bodies and rotors along the reference, `(samples, joints)`."""
     model = plant.model()
     model.dof_damping[:] = 0
     model.dof_frictionloss[:] = 0

@@ -1,4 +1,4 @@
-"""The cases of the worlds bench: which robot, friction, noise, law and effect, from one seed."""
+"""Cases of the worlds benchmark: robot, friction, noise, law and effect, from one seed."""
 
 import math
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ NAMES = ("fit_1", "fit_2", "held_out")
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a case is to be; `law` is what the user knows of the controller."""
+    """Specification of a case; `law` is the user's knowledge of the controller."""
 
     number: int
     kind: str
@@ -46,13 +46,13 @@ class Wanted:
 
     @property
     def label(self) -> str:
-        """For file names and tables."""
+        """Name in files and tables."""
         return f"{self.number:03d}_{self.law}_{self.kind}_{'+'.join(self.effects) or 'nothing'}"
 
 
 @dataclass(frozen=True)
 class Case:
-    """A case as it was made; torques of the noise as they are in the recordings."""
+    """A simulated case; torques of the noise as in the recordings."""
 
     robot: Robot
     law: Law
@@ -66,7 +66,7 @@ class Case:
 
 
 def draw_wanted(master: int, count: int, laws: Sequence[str], robot: str = "any") -> list[Wanted]:
-    """`count` cases, each read with every law: six in ten with one effect, two of ten clean."""
+    """`count` cases, each with every law: six of ten with one effect, two of ten clean."""
     rng = np.random.default_rng(master)
     wanted = []
     for number in range(count):
@@ -105,7 +105,7 @@ def make(wanted: Wanted) -> Case:
             viscous=float(load[j] / speed[j] * rng.uniform(0.05, 0.2)),
             coulomb=float(load[j] * rng.uniform(0.1, 0.4)),
             family=wanted.friction,
-            # Sharp enough that nobody sees it, to clearly rounded; stable at 0.1 ms.
+            # From too sharp to be visible, to clearly rounded; stable at 0.1 ms.
             width=float(speed[j] * math.exp(rng.uniform(math.log(0.002), math.log(0.03)))),
         )
         for j in range(len(m))
@@ -156,7 +156,7 @@ def _along(effect: Hidden, run: Signals) -> np.ndarray:
 
 
 def _hidden(rng, wanted, robot, frictions, speed, duration, clean, level) -> tuple[Hidden, ...]:
-    """The effects, each 3 to 12 times the noise before anything makes up for it."""
+    """The effects, each 3 to 12 times the noise before parameters absorb a part."""
     found = []
     for name in wanted.effects:
         places = [j for j, link in enumerate(robot.links) if not (link.slides and name in TURNING)]
@@ -175,7 +175,7 @@ def _hidden(rng, wanted, robot, frictions, speed, duration, clean, level) -> tup
 def _recorded(
     rng: np.random.Generator, run: Signals, rate: int, level: np.ndarray, noise: str
 ) -> dict[str, np.ndarray]:
-    """The run as it was logged: at `rate`, torque with noise of its own."""
+    """The logged run: at `rate`, with noise in the torque."""
     every = 1000 // rate
     tau = run.tau[::every]
     errors = _noise(rng, tau.shape, noise) * level
@@ -189,7 +189,7 @@ def _recorded(
 
 
 def _noise(rng: np.random.Generator, shape: tuple[int, ...], kind: str) -> np.ndarray:
-    """Noise with a deviation of one."""
+    """Noise with a standard deviation of one."""
     white = rng.standard_normal(shape)
     if kind == "coloured":
         pole = rng.uniform(0.5, 0.9)
@@ -203,7 +203,7 @@ def _noise(rng: np.random.Generator, shape: tuple[int, ...], kind: str) -> np.nd
 
 
 def start_model(case: Case, law: str) -> jaxid.ClosedLoop:
-    """What a user would write: the drawing's URDF, bodies to be fitted, the law if it is known."""
+    """The model of a user: the drawn URDF, bodies to be fitted, the law if it is known."""
     known = case.law
     pid = jaxid.control.PID(Kp=list(known.Kp), Ki=list(known.Ki), Kd=list(known.Kd))
     controller = {
@@ -221,7 +221,7 @@ def start_model(case: Case, law: str) -> jaxid.ClosedLoop:
 
 
 def read_case(folder: Path, case: Case) -> tuple[jaxid.Recordings, jaxid.Recordings]:
-    """The case as a user has it: CSV files, written and read; to fit and held out."""
+    """The recordings of a case, written to CSV files and read: to fit, and held out."""
     folder.mkdir(parents=True, exist_ok=True)
     n = len(case.robot.links)
     for name, signals in case.recordings.items():

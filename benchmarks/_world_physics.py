@@ -1,4 +1,4 @@
-"""Robots, friction and effects of the worlds bench, drawn; none of it knows jaxid's formulas."""
+"""Random robots, friction and effects of the worlds benchmark, without jaxid's formulas."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -40,7 +40,7 @@ class Link:
     travel: float
 
     def drawn(self, wrong: Sequence[float]) -> "Link":
-        """As somebody's drawing has it: mass, centre and inertia off by these factors."""
+        """The link in a wrong drawing: mass, centre and inertia multiplied by these factors."""
         centre = tuple(x * wrong[1] for x in self.centre)
         inertia = self.inertia * wrong[2]
         return Link(
@@ -57,13 +57,13 @@ class Link:
 
 @dataclass(frozen=True)
 class Robot:
-    """A chain of links on a frame that stands still."""
+    """A chain of links on a fixed frame."""
 
     name: str
     links: tuple[Link, ...]
 
     def urdf(self, wrong: np.ndarray | None = None) -> str:
-        """Its URDF; with factors `(links, 3)`, one that is wrong by them."""
+        """Its URDF; with factors `(links, 3)`, a URDF that is wrong by these factors."""
         links = self.links
         if wrong is not None:
             links = tuple(link.drawn(w) for link, w in zip(links, wrong, strict=True))
@@ -87,13 +87,13 @@ class Robot:
 
 
 def draw_robot(rng: np.random.Generator, name: str) -> Robot:
-    """One of its kind, by masses, lengths and rotors."""
+    """A robot of a kind with random masses, lengths and rotors."""
     turn = {"planar": (0.0, 1.0, 0.0), "pendulum": (0.0, 1.0, 0.0)}.get(name, (0.0, 0.0, 1.0))
 
     def turning(at: float) -> Link:
         mass, length = rng.uniform(1.0, 5.0), rng.uniform(0.25, 0.5)
         sideways = rng.uniform(-0.02, 0.02)
-        # Down for the arms that swing, along x for the others.
+        # Down for arms under gravity, along x for the others.
         centre = (0.0, 0.0, -length / 2) if turn[1] else (length / 2, 0.0, 0.0)
         place = (0.0, 0.0, -at) if turn[1] else (at, 0.0, 0.0)
         centre = (centre[0] + sideways, centre[1], centre[2])
@@ -133,7 +133,7 @@ class Friction:
     width: float
 
     def sign(self, v: float) -> float:
-        """The sign of velocity as this world has it; zero where the simulator's own is used."""
+        """The sign of velocity in this world; zero if the simulator's own friction is used."""
         x = v / self.width
         if self.family == "tanh":
             return math.tanh(x)
@@ -144,7 +144,7 @@ class Friction:
         return 0.0
 
     def edge(self, v: float) -> float:
-        """A sign for effects, also where the base friction is the simulator's own."""
+        """The sign for effects, also if the base friction is the simulator's own."""
         return math.tanh(v / self.width) if self.family == "dry" else self.sign(v)
 
 
@@ -160,7 +160,7 @@ class Hidden:
     drawn: dict[str, float]
     slides: bool = False
     size: float = 0.0
-    # Of effects with a memory.
+    # State of effects with memory.
     state: float = 0.0
 
     def shape(
@@ -178,11 +178,11 @@ class Hidden:
             case "quadratic_drag":
                 return w * abs(w)
             case "load_dependent_friction":
-                # By the torque that reaches the link.
+                # Depends on the torque that reaches the link.
                 f = self.friction
                 return abs(tau[j] - f.coulomb * sign - f.viscous * w) * sign
             case "position_dependent_friction":
-                # Once or twice a turn, or along the travel of a joint that slides.
+                # Once or twice per turn, or along the travel of a sliding joint.
                 angle = 0.5 * math.pi * x if self.slides else q[j]
                 return sign * math.cos(d["turns"] * angle + d["phase"])
             case "hysteresis":
@@ -214,7 +214,7 @@ class Hidden:
 
 
 def draw_shape(rng: np.random.Generator, name: str, duration: float) -> dict[str, float]:
-    """The numbers that give an effect its shape; speeds and places as shares of what is reached."""
+    """Shape parameters of an effect; speeds and positions are shares of the motion's range."""
     uniform = rng.uniform
     draws: dict[str, dict[str, float]] = {
         "stribeck": {"velocity": uniform(0.03, 0.12), "exponent": float(rng.choice([1.0, 2.0]))},
@@ -240,7 +240,7 @@ def draw_shape(rng: np.random.Generator, name: str, duration: float) -> dict[str
 
 @dataclass(frozen=True)
 class Reference:
-    """Positions asked for: sums of sines, or moves from point to point with rests between."""
+    """Reference positions: sums of sines, or moves from point to point with rests between."""
 
     kind: str
     parts: tuple[tuple[tuple[float, float, float], ...], ...] = field(default=())

@@ -1,4 +1,4 @@
-"""Result files of the worlds bench: a line of JSON for each case, with where it comes from."""
+"""Result files of the worlds benchmark: a line of JSON for each case, with its origin."""
 
 import json
 import subprocess
@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TextIO
 
-# What of a discovery's story a result file keeps beside the probabilities.
+# Fields of a story that a result file keeps, in addition to the probabilities.
 _KEPT = (
     "verdict",
     "reason",
@@ -22,8 +22,8 @@ _KEPT = (
 
 
 def origin(seed: int) -> dict[str, Any]:
-    """Seed of the bench, date (UTC) and commit of what runs now; the commit ends in `-dirty` where
-    files were changed, and is None outside a checkout."""
+    """Seed of the benchmark, date (UTC) and commit of the running code; the commit ends in `-dirty`
+    if files were changed, and is None outside a checkout."""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:
         ran = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
@@ -40,7 +40,7 @@ def probabilities(models: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         for key in {(e["effect"], e["joint"]) for e in model["effects"]}:
             total[key] = total.get(key, 0.0) + model["weight"]
     ranked = sorted(total.items(), key=lambda pair: -pair[1])
-    # What has no weight to speak of would make most of the file.
+    # Models of negligible weight would fill most of the file.
     return [
         {"effect": name, "joint": joint, "probability": min(weight, 1.0)}
         for (name, joint), weight in ranked
@@ -49,7 +49,7 @@ def probabilities(models: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def line_of(record: dict[str, Any]) -> dict[str, Any]:
-    """A case of jaxid's as a result file has it: marks and answer, without tables of models."""
+    """A case of jaxid for a result file: marks and answer, without tables of models."""
     if "story" not in record:
         return {"tool": "jaxid", **record}
     story = record["story"]
@@ -59,7 +59,7 @@ def line_of(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def append(file: TextIO, line: dict[str, Any]) -> None:
-    """Writes a line at once, so that a run that is stopped leaves the cases that ended."""
+    """Writes a line immediately; a stopped run keeps its finished cases."""
     file.write(json.dumps(line, ensure_ascii=False, default=float) + "\n")
     file.flush()
 
@@ -67,7 +67,7 @@ def append(file: TextIO, line: dict[str, Any]) -> None:
 def read_lines(paths: Iterable[Path]) -> list[dict[str, Any]]:
     """The lines of result files, of any tools.
 
-    **Raises:** `ValueError` for a line that is none.
+    **Raises:** `ValueError` for a line that is not a case.
     """
     found = []
     for path in paths:

@@ -1,4 +1,4 @@
-"""A drawn robot under a sampled law, simulated by MuJoCo at 0.1 ms."""
+"""A random robot under a sampled law, simulated by MuJoCo at 0.1 ms."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ TICK = 10  # steps
 
 @dataclass(frozen=True)
 class Law:
-    """PD with an integral if wanted, at 1 kHz, from encoders, velocity by low-passed difference."""
+    """PD, optionally with integral, at 1 kHz from encoders; velocity by low-passed difference."""
 
     Kp: tuple[float, ...]
     Ki: tuple[float, ...]
@@ -26,7 +26,7 @@ class Law:
 
 @dataclass(frozen=True)
 class Signals:
-    """What a simulation gives at 1 kHz: `(ticks, joints)`; `speed` and `drive` without errors."""
+    """Simulated signals at 1 kHz, `(ticks, joints)`; `speed` and `drive` are exact."""
 
     time: np.ndarray
     q: np.ndarray
@@ -36,7 +36,7 @@ class Signals:
 
 
 def loaded(robot: Robot, frictions: Sequence[Friction]) -> mujoco.MjModel:
-    """MuJoCo's model of the robot, with rotors, and dry friction where the family asks for it."""
+    """MuJoCo's model of the robot with rotors, and with dry friction for that kind of friction."""
     model = mujoco.MjModel.from_xml_string(robot.urdf())
     model.opt.timestep = STEP
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -67,7 +67,7 @@ def simulate(
     duration: float,
     hidden: Sequence[Hidden] = (),
 ) -> Signals:
-    """A run from rest: commanded torque is held between ticks, and acts at once."""
+    """A run from rest; commanded torque is held between ticks, and acts without delay."""
     model = loaded(robot, frictions)
     data = mujoco.MjData(model)
     n = len(robot.links)

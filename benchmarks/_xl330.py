@@ -14,9 +14,9 @@ from jaxid.parameters import Scalar, parameter
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data" / "xl330"
 NOMINAL, FULL, GRAVITY = 7.4, 885.0, 9.81
-# Duty cycle by error for kp = 1: 4096 counts a turn, and the law's divisors.
+# Duty cycle by error for kp = 1: 4096 counts per turn, and the law's divisors.
 GAIN = 4096 / (2 * np.pi) / 256 / FULL
-# As the publishers do: all on one clock of 5 ms.
+# As in the publication, all signals are on one clock of 5 ms.
 STEP = 0.005
 
 
@@ -42,12 +42,12 @@ class Pendulum(jaxid.arms.AbstractArm):
 
 
 def recordings(even: bool = True, supply: bool = False) -> dict[str, jaxid.Recording]:
-    """The twelve recordings by name, their duty cycle as a voltage.
+    """The twelve recordings by name, with the duty cycle as a voltage.
 
     **Arguments:**
 
-    - `even`: on a clock of 5 ms; else on their own, which is not uniform.
-    - `supply`: with the measured voltage in place of the nominal one.
+    - `even`: on a clock of 5 ms; otherwise on their own times, which are not uniform.
+    - `supply`: with the measured voltage instead of the nominal one.
     """
     found = {}
     for log in json.loads((DATA / "logs.json").read_text(encoding="utf-8"))["logs"]:

@@ -1,8 +1,8 @@
-"""The tools that people would use instead, on the recordings of the worlds bench.
+"""Other tools on the recordings of the worlds benchmark.
 
-Stepwise regression, pysindy, gplearn, a Gaussian process and a small network look for what the
-rigid robot with friction (SciPy's filters, Pinocchio's regressor) leaves of the same recordings
-that `benchmarks.worlds` makes of the same seed. Torque errors are in the band of an unknown law.
+Stepwise regression, pysindy, gplearn, a Gaussian process and a small network explain the residual
+of the rigid robot with friction (SciPy's filters, Pinocchio's regressor), on the recordings that
+`benchmarks.worlds` makes from the same seed. Torque errors are in the band of an unknown law.
 
 python -m benchmarks.baselines [--seed N] [--quick] [--count 40] [--robot NAME] [--tool NAME]
                                [--jobs 1] [--out DIR] [--results FILE] [--json FILE] [--case N]
@@ -41,7 +41,7 @@ NEEDED = ("gplearn", "pinocchio", "pysindy", "sklearn")
 
 
 def run_case(wanted: Wanted, seed: int, tools: Sequence[str]) -> dict[str, Any]:
-    """Makes one case of the bench with this seed, and asks every tool."""
+    """Makes one case of the benchmark with this seed, and runs every tool on it."""
     head = {"run": origin(seed), **asdict(wanted)}
     try:
         case = make(wanted)
@@ -101,10 +101,11 @@ def _after(answer: dict[str, Any]) -> list[float]:
 
 
 def judge(case: Case, kind: str, found: Found) -> dict[str, Any]:
-    """What was right of a tool's answer.
+    """The marks of a tool's answer.
 
-    A clean arm is left alone by who says that nothing is missing; an effect outside is answered
-    rightly by who names none, and recognised by who says besides that something is missing.
+    For a clean arm the right answer is that nothing is missing. For an effect outside the catalogue
+    it is right to name no effect; the effect is recognised if the tool also reports that something
+    is missing.
     """
     marks: dict[str, Any] = {"missing": found.missing}
     if kind == "clean":
@@ -118,10 +119,10 @@ def judge(case: Case, kind: str, found: Found) -> dict[str, Any]:
 
 
 def visible(case: Case, table: Table) -> list[float]:
-    """How much of each effect's torque the rigid robot cannot make up for, over the noise.
+    """The part of each effect's torque that the rigid robot cannot absorb, over the noise.
 
-    Root mean squares over the rows of its joint, of torque and noise low-passed alike; with two
-    effects each is taken alone.
+    Root mean squares over the rows of its joint, with the same low-pass for torque and noise. Two
+    effects are taken separately.
     """
     found = []
     names = list(case.recordings)[: len(table.motions)]

@@ -1,4 +1,4 @@
-"""Tables 2 and 3 of Brunot et al. 2016 beside what jaxid finds, and what the paper could not do.
+"""Tables 2 and 3 of Brunot et al. 2016 compared with jaxid, and joint PEM, which failed there.
 
 python -m benchmarks.brunot2016 [--quick] [--json FILE] [--figures FOLDER] [--draws 20] [--fd 50]
 
@@ -49,7 +49,7 @@ def noisy(m: Motion, seed: int) -> jaxid.Recording:
 
 
 def fits(fitted: jaxid.Recording) -> dict[str, jaxid.Fit]:
-    """Every method of the paper, and the joint one, from the CAD start."""
+    """Every method of the paper, and joint PEM, from the CAD start."""
     methods = {
         "LS": jaxid.IDIM(weights="ordinary"),
         "OEM": GIVEN,
@@ -61,7 +61,7 @@ def fits(fitted: jaxid.Recording) -> dict[str, jaxid.Fit]:
 
 
 def table_2(found: dict[str, jaxid.Fit]) -> pd.DataFrame:
-    """Values and relative deviations in %, the paper's beside ours."""
+    """Values and relative deviations in %, those of the paper and of jaxid."""
     names = list(found["OEM"].names)
     columns: dict[Any, Any] = {"truth": truth(names)}
     for name in ("LS", "OEM/PEM", "dev LS", "dev OEM", "dev PEM"):
@@ -96,7 +96,7 @@ def log_determinant(fit: jaxid.Fit) -> float:
 
 
 def from_cad(m: Motion, draws: int) -> pd.DataFrame:
-    """Joint and separable PEM of several noise draws, from the CAD start."""
+    """Joint and separable PEM for several noise draws, from the CAD start."""
     rows = []
     for seed in range(draws):
         fitted = noisy(m, 1000 + seed)
@@ -122,7 +122,7 @@ def from_cad(m: Motion, draws: int) -> pd.DataFrame:
 def finite_differences(m: Motion, runs: int, draws: int) -> pd.DataFrame:
     """The same squared error by SciPy, 58 values, two-point differences, CAD start.
 
-    Joint PEM's own final weights are given to it, so that its goal is the one joint PEM reached.
+    It gets joint PEM's final weights, so it minimises the same squared error.
     """
     rows = []
     for k in range(runs):
@@ -132,7 +132,7 @@ def finite_differences(m: Motion, runs: int, draws: int) -> pd.DataFrame:
         start = np.zeros(count)
         start[:8] = jaxid.scara().theta
         if k >= draws:
-            # Beyond the draws, starts differ: CAD values are known to a third or so.
+            # Beyond the draws, starts are varied by about a third.
             start[:8] *= np.random.default_rng(k).uniform(0.7, 1.3, 8)
         begun, calls = time.perf_counter(), 0
 
@@ -141,7 +141,7 @@ def finite_differences(m: Motion, runs: int, draws: int) -> pd.DataFrame:
             calls += 1
             wide = np.pad(x, (0, len(problem.lower) - len(x)))
             value = np.asarray(_residual(problem, jnp.asarray(wide))).reshape(-1)
-            # lsqnonlin refuses what is not finite as well.
+            # lsqnonlin also refuses values that are not finite.
             return np.where(np.isfinite(value), value, 1e6)
 
         low, high = (np.asarray(x)[:count] for x in (problem.lower, problem.upper))

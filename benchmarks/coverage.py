@@ -1,12 +1,12 @@
-"""Whether deviations are true: how often nominal 95 % intervals hold the simulated truth.
+"""Coverage of deviations: how often nominal 95 % intervals contain the simulated truth.
 
 python -m benchmarks.coverage [--quick] [--json FILE]
 
 Noise of the levels of Brunot et al. 2016, white and coloured (AR of orders 13 and 37), is drawn
 400 times on the torque of one 20 s motion of the independent simulator of tests/independent. The
-first draw is fitted from CAD, and the others are fitted from there by a few Gauss-Newton steps,
-vmapped (`jaxid.estimate.refit`). Beside the coverage: the actual spread of PEM and OEM, and the
-bias of five methods when encoder noise goes round the loop.
+first draw is fitted from CAD. The others are fitted from its estimate by a few Gauss-Newton steps,
+vmapped (`jaxid.estimate.refit`). Further results are the actual spread of PEM and OEM, and the
+bias of five methods if encoder noise is fed back in the loop.
 """
 
 import dataclasses
@@ -68,14 +68,14 @@ def literal(fit: jaxid.Fit, found: Refitted) -> np.ndarray:
 
 
 def _in_units(fit: jaxid.Fit) -> np.ndarray:
-    """From whitened residuals back to N·m."""
+    """Factor from whitened residuals to N·m."""
     problem = fit.optimum.problem
     mix = np.eye(len(problem.weights)) if problem.mix is None else np.asarray(problem.mix)
     return np.diag(1 / np.asarray(problem.weights)) @ np.linalg.inv(mix)
 
 
 def least_squares(m: Motion, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """IDIM-LS as in equation (5), whose deviations take filtered torque for white."""
+    """IDIM-LS as in equation (5), whose deviations assume that filtered torque is white."""
     clean = jaxid.Recordings.of(recording(m, 0.0))
     loop = jaxid.scara()
     stacked = stack(loop, clean, Filtering())
@@ -99,7 +99,7 @@ class Study:
     unsettled: dict[str, int]
 
     def coverage(self) -> pd.DataFrame:
-        """Share of draws whose 95 % interval holds the truth, %, by method and parameter."""
+        """Share of draws whose 95 % interval contains the truth, %, by method and parameter."""
         t = truth(self.names)
         rows = {
             name: 100 * np.mean(np.abs(theta - t) <= 1.959964 * std, axis=0)
@@ -108,7 +108,7 @@ class Study:
         return pd.DataFrame(rows, index=list(self.names)).T
 
     def honesty(self) -> pd.DataFrame:
-        """Root mean square of the error in its own deviations: 1 where they are true."""
+        """Root mean square of the error in its own deviations: 1 if these are correct."""
         t = truth(self.names)
         rows = {
             name: np.sqrt(np.mean(((theta - t) / std) ** 2, axis=0))
@@ -127,11 +127,11 @@ class Study:
 
 
 def study(m: Motion, draws: int, coloured: bool, seed: int = 0) -> Iterator[Study]:
-    """All methods on the same draws, some draws at a time; every result holds those before."""
+    """All methods on the same draws, some draws at a time; results are cumulative."""
     noise = draw(m.run.tau, np.random.default_rng(seed), draws, coloured)
     first = recording(m, noise[0])
     signals = (m.run.tau + noise)[:, None]
-    # White noise gets the same filters: orders too high must do no harm.
+    # White noise gets the same filters: too high orders must do no harm.
     methods = {
         "OEM": GIVEN,
         "SEP-PEM": jaxid.SeparablePEM(GIVEN, orders=ORDERS),
@@ -161,12 +161,12 @@ def study(m: Motion, draws: int, coloured: bool, seed: int = 0) -> Iterator[Stud
         yield Study(fits["OEM"].names, found_so_far, dict(unsettled))
 
 
-# --- encoder noise that goes round the loop ------------------------------------------------------
+# --- encoder noise that is fed back in the loop ---------------------------------------------------
 
 
 @dataclass(frozen=True)
 class NoisyPD:
-    """The PD law of an encoder whose error is a line from sample to sample, rad."""
+    """The PD law with an encoder error that is linear from sample to sample, rad."""
 
     law: sim.PD
     error: np.ndarray
@@ -182,7 +182,7 @@ class NoisyPD:
 
 
 def bias(m: Motion, draws: int, deviation: float = 7e-5, seed: int = 0) -> pd.DataFrame:
-    """Mean relative error of each method in %, and how many of its standard errors that is."""
+    """Mean relative error of each method in %, and in units of its standard error."""
     rng = np.random.default_rng([seed, 1])
     methods = {
         "IDIM-LS": jaxid.IDIM(),
@@ -196,7 +196,7 @@ def bias(m: Motion, draws: int, deviation: float = 7e-5, seed: int = 0) -> pd.Da
     names: tuple[str, ...] = ()
     for _ in range(draws):
         error = deviation * rng.standard_normal(m.run.q.shape)
-        # The arm stands still at first, and the loop with it.
+        # Arm and loop are at rest at the start.
         error[0] = 0.0
         run = sim.simulate(
             sim.Scara(), m.reference, NoisyPD(sim.PD(), error), (), 20.0, 0.01, rtol=1e-7, atol=1e-9
@@ -206,7 +206,7 @@ def bias(m: Motion, draws: int, deviation: float = 7e-5, seed: int = 0) -> pd.Da
         for name, method in methods.items():
             loop = jaxid.scara()
             if start is not None and name in ("IDIM-IV", "DIDIM", "OEM"):
-                # These want a start that can be simulated; LS gives one.
+                # These need a start that can be simulated; LS gives one.
                 loop = loop.with_theta(np.maximum(start, 1e-4))
             fit = jaxid.fit(loop, recording(seen, 0.0), method)
             start = fit.theta if start is None else start
@@ -223,7 +223,7 @@ def bias(m: Motion, draws: int, deviation: float = 7e-5, seed: int = 0) -> pd.Da
 
 
 def tables(result: Study) -> dict[str, pd.DataFrame]:
-    """What a study says, by title."""
+    """The tables of a study, by title."""
     return {
         "coverage of 95 % intervals, %": result.coverage(),
         "error in its own deviations (root mean square)": result.honesty(),

@@ -1,6 +1,6 @@
-"""The measured double pendulum by every method, beside its authors' values.
+"""The measured double pendulum by every method, compared with the published values.
 
-A method that the recordings do not suit says so in its row.
+If a method is not suitable for the recordings, its row has the reason.
 
 python -m benchmarks.double_pendulum [--quick] [--json FILE]
 """
@@ -20,7 +20,7 @@ from ._output import options, report
 DATA = Path(__file__).parents[1].parent / "shared" / "data" / "double_pendulum"
 LENGTH = 0.3
 WINDOW = 0.5
-# One low-pass for every method and recording, so that errors are of the same torque.
+# One low-pass for every method and recording, so all errors refer to the same torque.
 CUTOFF = 8.0
 FILTERING = jaxid.Filtering(cutoff=CUTOFF, rate=50.0)
 COLUMNS = {
@@ -36,7 +36,7 @@ AUTHORS = {
     "p4": 0.5594 * 0.3 + 0.6043 * LENGTH,
     "p5": 0.6043 * 0.1838,
 }
-# The filtered regressions' poles are where the others' low-pass is.
+# The poles of filtered regressions are at the cutoff of the other methods.
 POLE = 2 * np.pi * CUTOFF
 COUNT = 3.81e-4
 _states = {"states": jaxid.LowPass(FILTERING)}
@@ -62,13 +62,13 @@ def recordings(*numbers: int) -> jaxid.Recordings:
 
 
 def authors(fitting: jaxid.Recordings) -> jaxid.Fit:
-    """The authors' inertial values, with friction fitted as for the others, by IDIM."""
+    """The published inertial values, with friction fitted by IDIM."""
     loop = jaxid.two_link(Tracking(cutoff=CUTOFF), link_length=LENGTH).hold(**AUTHORS)
     return jaxid.fit(loop, fitting, jaxid.IDIM(filtering=FILTERING))
 
 
 def errors(loop: jaxid.ClosedLoop, unseen: jaxid.Recordings) -> dict[str, float]:
-    """Torque error when the recorded motion is tracked, position error over open-loop windows."""
+    """Torque error along the recorded motion, position error over open-loop windows."""
     tracking = dataclasses.replace(loop, controller=Tracking(cutoff=CUTOFF))
     torque = jaxid.compare(tracking, unseen).error_percent.iloc[0]
     driven = dataclasses.replace(loop, controller=OpenLoop())

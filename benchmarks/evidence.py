@@ -1,8 +1,8 @@
-"""Writes what the result files of `benchmarks.worlds` and `benchmarks.baselines` say into a page.
+"""Writes tables from the results of `benchmarks.worlds` and `benchmarks.baselines` into a page.
 
-Only what stands between `<!-- made: NAME -->` and `<!-- end: NAME -->` is written anew, NAME being
-worlds, calibration, baselines or power; the rest of the page is left as it is. The figure of the
-power curves (needs the extra `static`) goes to `img/power.png` beside the page.
+Only the text between `<!-- made: NAME -->` and `<!-- end: NAME -->` is replaced, where NAME is
+worlds, calibration, baselines or power. The figure of the power curves (needs the extra `static`)
+is written to `img/power.png` in the folder of the page.
 
 python -m benchmarks.evidence RESULTS... [--page docs/evidence.md] [--no-figure]
 """
@@ -23,7 +23,7 @@ PICTURE = Path("img") / "power.png"
 
 
 def sections(lines: Sequence[Line]) -> dict[str, str]:
-    """The text of every section that there are results for."""
+    """The text of every section for which there are results."""
     ours = [x for x in lines if x["tool"] == "jaxid"]
     found = {}
     if ours:
@@ -47,7 +47,7 @@ def sections(lines: Sequence[Line]) -> dict[str, str]:
 
 
 def same_cases(lines: Sequence[Line]) -> list[Line]:
-    """The lines of the cases that every tool was given, with the law unknown."""
+    """The lines of cases that were given to every tool, with the law unknown."""
     unknown = [x for x in lines if x["law"] == "unknown"]
     tools = {x["tool"] for x in unknown}
     asked: dict[int, set[str]] = {}
@@ -57,7 +57,7 @@ def same_cases(lines: Sequence[Line]) -> list[Line]:
 
 
 def origins(lines: Sequence[Line]) -> str:
-    """How many cases of which seeds, when, and of which commits."""
+    """Number of cases, seeds, dates and commits."""
     cases = len({(x["seed"], x["law"]) for x in lines})
     runs = [x["run"] for x in lines]
     seeds, dates, commits = (
@@ -68,7 +68,7 @@ def origins(lines: Sequence[Line]) -> str:
 
 
 def markdown(table: pd.DataFrame, corner: str = "") -> str:
-    """A table as Markdown has it."""
+    """A table in Markdown."""
     head = [f"| {' | '.join([corner, *map(str, table.columns)])} |"]
     rule = [f"|{' --- |' * (len(table.columns) + 1)}"]
     cells = [[str(k), *row] for k, row in zip(table.index, table.to_numpy(), strict=True)]
@@ -76,9 +76,9 @@ def markdown(table: pd.DataFrame, corner: str = "") -> str:
 
 
 def placed(page: str, texts: dict[str, str]) -> str:
-    """The page with sections in place of what stood between their marks.
+    """The page with new sections between their marks.
 
-    **Raises:** `ValueError` where a section has no marks in the page, or two pairs of them.
+    **Raises:** `ValueError` if a section has no marks in the page, or several pairs.
     """
     for name, text in texts.items():
         begin, end = f"<!-- made: {name} -->", f"<!-- end: {name} -->"

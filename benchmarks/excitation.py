@@ -1,10 +1,11 @@
-"""What an optimised reference is worth: against random ones, within its limits, as predicted.
+"""An optimised reference: compared with random ones, checked against limits and predictions.
 
-The two-link arm of benchmarks/li2023 and its limits. First the optimised reference and the best
-of 1000 random feasible ones, by the geometric mean of the predicted deviations; then the limits
-at ten times the sample rate; then the loop that tracks it (the independent simulator of
-tests/independent) with torque noise of a hundredth of the limits, 400 draws (100 leave 7 % to
-chance): the deviations found by the regression, or by OEM, over those predicted.
+The arm and its limits are those of benchmarks/li2023. The first comparison is between the optimised
+reference and the best of 1000 random feasible ones, by the geometric mean of the predicted
+deviations. Then the limits are checked at ten times the sample rate. Finally the loop that tracks
+the reference is simulated (independent simulator of tests/independent) with torque noise of a
+hundredth of the limits, 400 draws (100 draws have 7 % of scatter). The result is the ratio of the
+deviations of the regression, or of OEM, to the predicted ones.
 
 python -m benchmarks.excitation [--quick] [--json FILE]
 """
@@ -34,12 +35,12 @@ def geometric(std: np.ndarray) -> float:
 
 
 def best_random(kind: str, count: int) -> float:
-    """The smallest geometric mean of deviations among random references that keep the limits."""
+    """The smallest geometric mean of deviations among random references within the limits."""
     design, centre = make_design(
         li2023.loop(), LIMITS, period=PERIOD, harmonics=HARMONICS, rate=1 / TICK, kind=kind
     )
     drawn, scores = random_references(design, centre, count, seed=7)
-    # By the very measure that is compared, not only by the criterion of the search.
+    # Chosen by the measure that is compared, not by the criterion of the search.
     found = [
         geometric(np.sqrt(np.diag(np.linalg.inv(information_along(design, drawn[k])))))
         for k in np.argsort(scores)[:20]
@@ -65,7 +66,7 @@ def estimates(reference: Excitation, runs: sim.Batch, kind: str, draws: int) -> 
         return np.asarray(li2023.chord(reference.series, runs, part).solve(jnp.asarray(noisy)))
     model, method = li2023.loop(), jaxid.DifferenceLS(jaxid.Differences("central"))
     found = []
-    # The command holds from tick to tick; at a tick a sensor sees the mean of before and after.
+    # The command is constant between ticks; at a tick the mean of before and after is recorded.
     seen = (runs.tau + np.roll(runs.tau, 1, axis=1)) / 2 + noise
     for tau in seen:
         recording = jaxid.Recording.from_arrays(runs.time[1:], runs.q[0, 1:], tau[1:])
@@ -74,7 +75,7 @@ def estimates(reference: Excitation, runs: sim.Batch, kind: str, draws: int) -> 
 
 
 def study(kind: str, quick: bool) -> dict[str, float]:
-    """One kind of information: worth, limits and honesty of the optimised reference."""
+    """For one kind of information: gain, limits and predictions of the optimised reference."""
     started = time.perf_counter()
     settings = {"tries": 40, "starts": 1, "rounds": 4} if quick else {"tries": 200, "starts": 4}
     if kind == "closed-loop" and not quick:

@@ -1,11 +1,11 @@
-"""Every reader, and `jaxid.load`, under bytes that nobody would write.
+"""Every reader, and `jaxid.load`, with malformed bytes.
 
 python -m benchmarks.fuzz [--seconds 60] [--seed N] [--quick] [--json FILE] [--atheris FOLDER]
 
-Valid files are cut, flipped, spliced and forged (members of archives changed, their checksums made
-right again). Whatever comes of it must be a result, or one sentence of jaxid's own; in time, and in
-bounded memory. `--atheris` has libFuzzer look for bytes that reach new code instead, if the package
-atheris is there; FOLDER keeps its corpus.
+Valid files are cut, flipped, spliced and forged (members of archives are changed and checksums
+adapted). The outcome must be a result, or one sentence of jaxid, within limits of time and memory.
+With `--atheris` libFuzzer searches for bytes that reach new code instead, if the package atheris is
+installed; FOLDER keeps its corpus.
 """
 
 import argparse
@@ -35,7 +35,7 @@ import jaxid
 from jaxid.errors import JaxidError
 from jaxid.storage import archive, saved
 
-# What a reader may take for a file of a few kilobytes, on a machine that does other things too.
+# Limits of a reader for a file of a few kilobytes, on a machine with other work.
 SLOWEST = 20.0
 EDGES = (0, 1, 127, 128, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
 
@@ -81,7 +81,7 @@ def _written(write: Callable[[io.BytesIO], Any]) -> bytes:
 
 
 def mutated(rng: np.random.Generator, content: bytes, other: bytes) -> bytes:
-    """A file with a few things wrong."""
+    """A file with a few errors."""
     data = bytearray(content)
     for _ in range(int(rng.integers(1, 4))):
         at = int(rng.integers(len(data) + 1))
@@ -109,7 +109,7 @@ def mutated(rng: np.random.Generator, content: bytes, other: bytes) -> bytes:
 
 
 def forged(rng: np.random.Generator, content: bytes, other: bytes) -> bytes:
-    """An archive with something wrong inside, and checksums that say it is right."""
+    """An archive with an error inside, and matching checksums."""
     with zipfile.ZipFile(io.BytesIO(content)) as file:
         members = {name: file.read(name) for name in file.namelist()}
     name = str(rng.choice([n for n in members if n != "manifest.sha256"]))
@@ -132,9 +132,9 @@ def forged(rng: np.random.Generator, content: bytes, other: bytes) -> bytes:
 
 
 def attempt(ending: str, content: bytes, folder: Path) -> str:
-    """What became of a file: `read` or `refused`.
+    """The outcome of a file: `read` or `refused`.
 
-    **Raises:** whatever else came of it.
+    **Raises:** any other exception of the reader.
     """
     path = folder / f"run.{ending}"
     path.write_bytes(content)
@@ -152,7 +152,7 @@ def attempt(ending: str, content: bytes, folder: Path) -> str:
 
 
 def fuzz(seconds: float, seed: int) -> tuple[pd.DataFrame, list[dict[str, Any]]]:
-    """Counts by ending, and what should not have happened."""
+    """Counts by ending, and unexpected outcomes."""
     rng = np.random.default_rng(seed)
     files = valid_files()
     every = [content for contents in files.values() for content in contents]
@@ -225,7 +225,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for counts and findings")
     parser.add_argument("--atheris", type=Path, metavar="FOLDER")
     given = parser.parse_args()
-    # A reader in C may end the process; its input then stays behind in the temporary folder.
+    # A reader in C may end the process; its input then remains in the temporary folder.
     faulthandler.enable()
     seconds = 2.0 if given.quick else given.seconds
     if given.atheris is not None:

@@ -1,11 +1,11 @@
-"""Which minimiser, which gradient: one fit by every minimiser, and its gradient by every way.
+"""Minimisers and gradients: one fit by every minimiser, and its gradient by every method.
 
-The problem is one: output error of the SCARA along one recording, white noise. The first table is
-that of `benchmarks.minimisers`. The second has the gradient of the squared error, five per cent
-beside the truth: its error against extrapolated differences of the same discrete simulation (so
-that what is left is the gradient's own error, not the integration's), seconds of the first call,
-milliseconds of later ones, and the peak of resident memory above that of the simulation alone.
-Every row has a process of its own, where nothing is compiled yet.
+The problem is output error of the SCARA along one recording with white noise. The first table is
+that of `benchmarks.minimisers`. The second is about the gradient of the squared error at values
+five per cent from the truth. It has the error relative to extrapolated differences of the same
+discrete simulation (which excludes the integration error), seconds of the first call, milliseconds
+of later ones, and the peak of resident memory above that of the simulation alone. Every row is a
+separate process, in which nothing is compiled yet.
 
 python -m benchmarks.gradients [--quick] [--json FILE]
 """
@@ -49,23 +49,23 @@ ADJOINTS: dict[str, diffrax.AbstractAdjoint] = {
     "reverse mode, BacksolveAdjoint": diffrax.BacksolveAdjoint(),
 }
 WAYS = (ALONE, OURS, *ADJOINTS, TWO_POINT, THREE_POINT)
-# Compiling is most of a short run: one reverse mode is enough for it.
+# Compilation dominates a short run, so it has only one reverse mode.
 FEW = tuple(way for way in WAYS if not way.endswith(("CheckpointAdjoint", "BacksolveAdjoint")))
 
 
 def simulation(recs: jaxid.Recordings, adjoint: diffrax.AbstractAdjoint | None) -> Way:
     """Torque as a function of the parameters, `(recordings, samples, joints)`.
 
-    The only place that knows how a loop is integrated.
+    Only this function depends on the integration of loops.
 
     **Arguments:**
 
-    - `adjoint`: of one `diffrax.diffeqsolve` for each recording, with the steps that jaxid takes;
+    - `adjoint`: adjoint of one `diffrax.diffeqsolve` for each recording, with the steps of jaxid;
       None for jaxid's own run.
     """
     loop = cad()
     batch = prepare(loop, recs)
-    # NumPy's arrays: the backsolve adjoint takes no derivative by what it closes over.
+    # NumPy arrays, because the backsolve adjoint gives no derivative by closed-over values.
     drives = jax.tree.map(np.asarray, (batch.intervals, batch.q0, batch.v0))
 
     def own(theta: Theta) -> Array:
@@ -92,7 +92,7 @@ def _solved(loop: jaxid.ClosedLoop, theta: Theta, intervals: Interval, q, v, adj
         interval = jax.tree.map(lambda leaf: jnp.asarray(leaf)[k], intervals)
         return unrolled(now, interval, t, x, theta)(interval, t, x, theta)[0]
 
-    # Backwards in time diffrax turns the sign of a step, which jaxid's RK4 does not ask for.
+    # Backwards in time diffrax changes the sign of a step, which jaxid's RK4 does not support.
     backwards = isinstance(adjoint, diffrax.BacksolveAdjoint)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
@@ -104,7 +104,7 @@ def _solved(loop: jaxid.ClosedLoop, theta: Theta, intervals: Interval, q, v, adj
         theta,
         saveat=diffrax.SaveAt(ts=times),
         adjoint=adjoint,
-        # Times are sums of steps, and rounding may leave one more to take.
+        # Times are sums of steps; rounding may require one more step.
         max_steps=SUBSTEPS * len(times),
     )
     return jax.vmap(lambda i, x: now(i, i.t0, x, theta)[1])(intervals, solution.ys)
@@ -138,7 +138,7 @@ def gradient(way: str, recs: jaxid.Recordings) -> Way:
 def _two_point(loss: Way) -> Way:
     def found(theta: Theta) -> Array:
         h = 1e-6 * jnp.maximum(jnp.abs(theta), 0.1)
-        # One program for all points, or the compiler would see each as another simulation.
+        # One program for all points; otherwise the compiler would treat each as another simulation.
         values = jax.lax.map(loss, jnp.concatenate([theta[None], theta + jnp.diag(h)]))
         return (values[1:] - values[0]) / h
 
@@ -155,17 +155,17 @@ def _three_point(loss: Way) -> Way:
 
 
 def place() -> np.ndarray:
-    """Where gradients are taken, `(parameters,)`."""
+    """Parameter values of the gradients, `(parameters,)`."""
     return 1.05 * np.array(list(TRUTH.values()))
 
 
 def extrapolated(recs: jaxid.Recordings, levels: int = 6) -> tuple[np.ndarray, float]:
-    """The gradient from central differences at steps that shrink by four (Ridders 1982).
+    """The gradient by central differences, with steps that decrease by four (Ridders 1982).
 
     Differences are of the torque, which has more digits than its squared error. Of each column's
-    extrapolations the one that differs least from its neighbours counts.
+    extrapolations the one that differs least from its neighbours is used.
 
-    **Returns:** the gradient, `(parameters,)`, and how far those neighbours are, relative to it.
+    **Returns:** the gradient, `(parameters,)`, and the relative distance of those neighbours.
     """
     theta, simulated = place(), simulation(recs, None)
     steps = 0.01 * theta * 4.0 ** -np.arange(levels)[:, None]
@@ -176,7 +176,7 @@ def extrapolated(recs: jaxid.Recordings, levels: int = 6) -> tuple[np.ndarray, f
     measured = np.stack([r.tau for r in recs])
     plus, minus = torque[1:].reshape(2, levels, len(theta), *measured.shape)
     residual = (measured - torque[0]) / NOISE**2
-    # Of the torque to its inner product with the residual: all that follows is linear in it.
+    # All later steps are linear in the torque, so its inner product with the residual suffices.
     slopes = np.einsum("lprkj,rkj->lp", plus - minus, -2 * residual) / (2 * steps)
     found = [_ridders(column) for column in slopes.T]
     best, gap = np.transpose(found)
@@ -198,7 +198,7 @@ def _ridders(slopes: Float[np.ndarray, " levels"]) -> tuple[float, float]:
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """One way's turn: which, along which recordings, and how often it runs warm."""
+    """A measurement of one method: its name, recordings, and number of warm runs."""
 
     way: str
     recordings: jaxid.Recordings
@@ -206,7 +206,7 @@ class Job:
 
 
 def measured(job: Job) -> dict[str, Any]:
-    """One row but for what it takes a reference to say."""
+    """One row, without the values that need a reference."""
     theta, found = jnp.asarray(place()), jax.jit(gradient(job.way, job.recordings))
     compiled = functools.cache(lambda: found.lower(theta).compile())
     value, cold, warm = cold_and_warm(lambda: compiled()(theta), job.repeats)
@@ -224,7 +224,7 @@ def measured(job: Job) -> dict[str, Any]:
 def table(
     recs: jaxid.Recordings, ways: tuple[str, ...], repeats: int, at_once: int = 1
 ) -> pd.DataFrame:
-    """A row for each of some ways to the gradient; the simulation alone is one of them."""
+    """A row for each method of computing the gradient, and one for the simulation alone."""
     rows = each_afresh(measured, [Job(way, recs, repeats) for way in ways], at_once)
     exact, uncertain = extrapolated(recs)
     print(f"the reference gradient is known to {uncertain:.0e} of itself")

@@ -1,4 +1,4 @@
-"""The blind bench: hidden effects drawn anew, given to `jaxid.discover`, judged by the truth.
+"""Benchmark of hidden effects: random effects, found by `jaxid.discover`, compared with the truth.
 
 python -m benchmarks.hidden_effects [--seed N] [--quick] [--json FILE] [--jobs 2] [--out DIR]
                                     [--robot scara|two_link|axis|any] [--law known|unknown]
@@ -31,7 +31,7 @@ from ._hidden_truth import chi_squared, hidden_in_base, same, true_key, visible
 
 
 def run_case(wanted: Wanted) -> dict[str, Any]:
-    """Makes, solves and judges one case."""
+    """Makes, solves and marks one case."""
     started = time.perf_counter()
     try:
         record = _solve(wanted)
@@ -68,11 +68,11 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
 def floor_percent(
     loop: jaxid.ClosedLoop, noise: np.ndarray, held_out: jaxid.Recordings
 ) -> np.ndarray:
-    """Relative error by joint that noise leaves of the held-out recording as it is compared, %.
+    """Relative error of the held-out recording due to noise, by joint, in the compared band, %.
 
     **Arguments:**
 
-    - `noise`: in the recorded torque, `(samples, joints)`, N·m or N.
+    - `noise`: noise of the recorded torque, `(samples, joints)`, N·m or N.
     """
     left, torque = (compared(loop, held_out, [x])[0] for x in (noise, np.asarray(held_out[0].tau)))
     return 100 * np.linalg.norm(left, axis=0) / np.linalg.norm(torque, axis=0)
@@ -81,7 +81,7 @@ def floor_percent(
 def _seen(
     found: jaxid.Discovery, k: int, case: sim.Case, held_out: jaxid.Recordings, law: str
 ) -> dict[str, Any]:
-    """What a step of the story looked like from inside, to learn from failures."""
+    """Details of a step of the story, for the analysis of failures."""
     step = found.steps[k]
 
     def line(verdict: Any) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def _seen(
         "label": step.label,
         "status": step.fit.status.name,
         "theta": values,
-        # By the true noise, which is not that of a band.
+        # The true noise is not restricted to a band.
         "chi_squared": chi_squared(case, step.fit, held_out) if law == "known" else None,
         "ranking": [line(v) for v in (step.diagnosis.ranking[:8] if step.diagnosis else ())],
         "where": [line(v) for v in (step.diagnosis.where[:4] if step.diagnosis else ())],
@@ -141,7 +141,7 @@ def configure_jax() -> None:
 def settle(
     out: Path, seed: int | None, quick: bool, robot: str, law: str
 ) -> tuple[int, bool, str, str]:
-    """The run that a folder holds already, or a new one, noted there."""
+    """The run that a folder already contains, or a new one, which is noted there."""
     note = out / "bench.json"
     if note.exists():
         had = json.loads(note.read_text(encoding="utf-8"))
@@ -188,7 +188,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _all(cases: Sequence[Wanted], campaign: Campaign, jobs: int) -> Iterable[dict[str, Any]]:
-    """Stored cases first, then the others as they end."""
+    """Stored cases first, then the others as they finish."""
     wanted = {case.label: case for case in cases}
     for label, record in campaign.run(run_case, wanted, jobs=jobs):
         if isinstance(record, Failed):

@@ -1,12 +1,12 @@
-"""Encoders from 2^10 to 2^18 counts a turn: the methods of Li, Peng and Juang 2023 side by side.
+"""Encoders from 2^10 to 2^18 counts per turn: comparison of the methods of Li, Peng and Juang 2023.
 
-A two-link arm under gravity (the independent simulator of tests/independent, friction included)
-tracks an optimised reference by computed torque on a model 20 % too light, sampled at 500 Hz from
-encoders alone. Each draw has its own place of the encoders' edges; torque is exact, so every error
-is the encoders' work. The paper's own settings are not public, so these are chosen: a period of
-5 s, the second and third of which are used (OEM, which starts at rest: the first two); poles of
-40 1/s for filtered and integral regressions alike; velocities by backward differences (Appendix
-C), and by zero-phase low-pass in the rows that say so.
+A two-link arm under gravity (the independent simulator of tests/independent, with friction) tracks
+an optimised reference by computed torque with a model that is 20 % too light, sampled at 500 Hz
+with encoders only. The encoders' edges differ between draws. Torque is exact, so all errors are due
+to the encoders. The paper's settings are not public; these are chosen: a period of 5 s, of which
+the second and third are used (for OEM, which starts at rest, the first two); poles of 40 1/s for
+filtered and integral regressions; velocities by backward differences (Appendix C), and by a
+zero-phase low-pass in the rows with that name.
 
 python -m benchmarks.li2023 [--quick] [--bits 10 11 ...] [--json FILE] [--figure FILE]
 """
@@ -73,13 +73,13 @@ METHODS: dict[str, jaxid.estimate.AbstractMethod] = {
 
 
 def model_of_the_law() -> sim.TwoLink:
-    """What the controller takes the arm for: a fifth too light."""
+    """The controller's model of the arm, a fifth too light."""
     light = {name: 0.8 * value for name, value in TRUTH.items() if name.startswith("p")}
     return dataclasses.replace(TRUE, **light)
 
 
 def loop() -> jaxid.ClosedLoop:
-    """The closed loop as jaxid has it, at the true values."""
+    """The closed loop in jaxid, at the true values."""
     light = {name: getattr(model_of_the_law(), name) for name in INERTIAL}
     law = ComputedTorque(jaxid.arms.TwoLink(**light), **GAINS, every=TICK, window=5)
     return jaxid.two_link(law).with_values(**TRUTH)
@@ -93,7 +93,7 @@ def excitation(quick: bool = False) -> Excitation:
 
 
 def draw(series: FourierSeries, bits: tuple[int, ...], chosen: range) -> dict[int, sim.Batch]:
-    """Recordings of every resolution, all simulated side by side; `chosen` says which draws."""
+    """Recordings of every resolution, all simulated at once; `chosen` are the draws."""
     draws = len(chosen)
     offset = np.random.default_rng(2023).uniform(-0.5, 0.5, (DRAWS, 2))[chosen]
     offset = np.tile(offset, (len(bits), 1))
@@ -111,7 +111,7 @@ def draw(series: FourierSeries, bits: tuple[int, ...], chosen: range) -> dict[in
 
 
 def recording(runs: sim.Batch, k: int, bits: int, series: FourierSeries, part: slice):
-    """One draw as jaxid reads it."""
+    """One draw as a recording."""
     q_ref = np.asarray(series(runs.time))[0]
     return jaxid.Recording.from_arrays(
         runs.time[part],
@@ -162,7 +162,7 @@ class Chord(eqx.Module):
 
 
 def chord(series: FourierSeries, runs: sim.Batch, part: slice = FROM_REST) -> Chord:
-    """What all draws share, for a part of their recordings that starts at rest."""
+    """The common part of all draws, for a part of their recordings that starts at rest."""
     one = recording(runs, 0, 18, series, part)
     model = with_substeps(loop(), jaxid.Recordings.of(one))
     batch = prepare(model, [one])
@@ -224,7 +224,7 @@ def table(found: Estimates) -> pd.DataFrame:
 
 
 def figure(found: pd.DataFrame) -> go.Figure:
-    """Error against resolution: a colour a family, dashed where weighted, open where smoothed."""
+    """Error over resolution: one colour per family, dashed if weighted, open if low-passed."""
     drawn = go.Figure()
     families = {"difference": 0, "filtered": 1, "integral": 2, "Fourier": 3, "OEM": 4}
     colours = figures.theme().layout.colorway
@@ -250,7 +250,7 @@ def figure(found: pd.DataFrame) -> go.Figure:
 
 
 def verdict(found: pd.DataFrame) -> str:
-    """Where the paper's claim holds: integral better than filtered better than difference."""
+    """Resolutions that confirm the paper: integral better than filtered better than difference."""
     table = found.pivot_table(index="bits", columns="method", values="inertial")
     integral, filtered, difference = (table[m] for m in ("integral", "filtered", "difference"))
 

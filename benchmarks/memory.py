@@ -1,9 +1,9 @@
-"""Seconds and memory of a fit of one recording, and how they grow with its length.
+"""Duration and memory of a fit of one recording, over its length.
 
 python -m benchmarks.memory [--quick] [--json FILE]
 
-Each fit has a process of its own, which reads the recording from a file: what made the recording
-does not count. Memory is the largest resident set, less that of the process before the fit.
+Each fit runs in a separate process, which reads the recording from a file, so making the recording
+does not count. Memory is the largest resident set minus that of the process before the fit.
 """
 
 import json
@@ -34,7 +34,7 @@ def written(seconds: float, folder: Path) -> Path:
 
 
 def fitted(path: str) -> None:
-    """Prints what a fit of the recording took, compiling included, and a second one."""
+    """Prints duration and memory of a first fit of the recording, and of a second one."""
     held = dict(np.load(path))
     recording = jaxid.Recording.from_arrays(
         held["time"], held["q"], held["tau"], q_ref=held["q_ref"]
@@ -53,13 +53,13 @@ def fitted(path: str) -> None:
 
 
 def _peak() -> float:
-    # Not what `resource` says: that counts what the parent held when it started this process.
+    # `resource` would include the memory of the parent when it started this process.
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line.split()[1] for line in lines if line.startswith("VmHWM"))) / 1024
 
 
 def row(minutes: float) -> dict[str, Any]:
-    """Of a recording of that length."""
+    """The row of a recording of that length."""
     with tempfile.TemporaryDirectory() as folder:
         made = f"from benchmarks.memory import *; written({60 * minutes}, Path({folder!r}))"
         subprocess.run([sys.executable, "-c", made], check=True)

@@ -1,8 +1,9 @@
-"""One fit by every minimiser: evaluations, time, and where it ends from the CAD start.
+"""One fit by every minimiser: evaluations, time, and the result from the CAD start.
 
-All minimise the same squared error of the same recording, with the same weights. jaxid's own and
-optimistix' run through `jaxid.estimate.minimise.minimise`, which is what `OEM(solver=...)` calls;
-SciPy's `least_squares` calls the same two compiled programs, simulation and linearisation.
+All minimise the same squared error of the same recording, with the same weights. jaxid's own
+minimiser and those of optimistix run by `jaxid.estimate.minimise.minimise`, like
+`OEM(solver=...)`. SciPy's `least_squares` calls the same two compiled programs, simulation and
+linearisation.
 """
 
 import collections
@@ -34,7 +35,7 @@ from jaxid.simulation.batch import prepare
 from ._fresh import cold_and_warm, each_afresh
 from ._problem import NOISE, cad, problem
 
-# Of optimistix' solvers; jaxid's own stops in standard deviations, SciPy's by 1e-8 by default.
+# Tolerance of optimistix' solvers; jaxid's is in standard deviations, SciPy's default is 1e-8.
 TOLERANCE = 1e-8
 MAX_STEPS = 100
 
@@ -45,10 +46,10 @@ STOCK = {
 }
 BY_DIFFERENCES, BY_JACOBIAN = "SciPy, differences", "SciPy, jaxid's Jacobian"
 MINIMISERS = (OURS, *STOCK, BY_DIFFERENCES, BY_JACOBIAN)
-# Every kind once: compiling is most of a short run.
+# Every kind once, because compilation dominates a short run.
 FEW = tuple(who for who in MINIMISERS if not who.endswith(("Dogleg", "GaussNewton")))
 
-# Kinds of evaluation; a linearisation holds the simulation that belongs to it.
+# Kinds of evaluation; a linearisation includes its simulation.
 SIMULATION, JACOBIAN = "simulations", "Jacobians"
 _COUNTED: collections.Counter[str] = collections.Counter()
 
@@ -58,10 +59,10 @@ def _count(kind: str) -> None:
 
 
 class Counted(Problem):
-    """A problem that counts its evaluations as they run, not as they are traced."""
+    """A problem that counts its evaluations at run time, not at tracing."""
 
     def whitened(self, plain: Sensitivity, extra: Float[Array, " _"], known=None) -> Sensitivity:
-        """As of any problem; simulations come without columns of derivatives."""
+        """As for any problem; simulations have no columns of derivatives."""
         kind = JACOBIAN if plain.jacobian.shape[-1] else SIMULATION
         jax.debug.callback(functools.partial(_count, kind))
         return super().whitened(plain, extra, known)
@@ -69,7 +70,7 @@ class Counted(Problem):
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """One minimiser's turn: which, on which recordings, and how often it runs warm."""
+    """A measurement of one minimiser: its name, recordings, and number of warm runs."""
 
     who: str
     recordings: jaxid.Recordings
@@ -77,7 +78,7 @@ class Job:
 
 
 def posed(recs: jaxid.Recordings) -> Problem:
-    """The fit, its residual in units of the noise."""
+    """The fit, with its residual in units of the noise."""
     loop = cad()
     return dataclasses.replace(problem(loop, prepare(loop, recs)), weights=jnp.full(2, 1 / NOISE))
 
@@ -89,7 +90,7 @@ def starts(asked: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ended(who: str, asked: Problem) -> tuple[np.ndarray, Status, int]:
-    """Where a minimiser ends from the CAD start, how, and after how many trial points."""
+    """Values and status of a minimiser from the CAD start, and its number of trial points."""
     theta, start = starts(asked)
     if who in (BY_DIFFERENCES, BY_JACOBIAN):
         return _by_scipy(asked, theta, start, who == BY_JACOBIAN)
@@ -104,7 +105,7 @@ def _by_scipy(
     around = linearisation(asked)
 
     def residual(x: np.ndarray) -> np.ndarray:
-        # SciPy refuses what is not finite, and a large error is refused as a step.
+        # SciPy raises for values that are not finite; for a large error it refuses the step.
         return np.nan_to_num(np.asarray(_simulated(asked, jnp.asarray(x))), nan=1e6)
 
     def jacobian(x: np.ndarray) -> np.ndarray:
@@ -130,11 +131,11 @@ def _simulated(asked: Problem, theta: Float[Array, " parameters"]) -> Float[Arra
 
 
 def measured(job: Job) -> dict[str, Any]:
-    """One row but for what it takes all ends to say."""
+    """One row, without the values that need the results of all minimisers."""
     asked = posed(job.recordings)
     found, cold, warm = cold_and_warm(lambda: ended(job.who, asked), job.repeats)
     theta, status, steps = found
-    # Apart from what is timed: a program that counts is another program.
+    # Separate from the timing, because a program that counts is another program.
     ended(job.who, Counted(**{f.name: getattr(asked, f.name) for f in dataclasses.fields(asked)}))
     jax.effects_barrier()
     return {
@@ -154,8 +155,8 @@ def table(
 ) -> pd.DataFrame:
     """A row for each of some minimisers.
 
-    Losses are relative to the lowest that one of them found, and parameters are held against that
-    one's, in the standard deviations that the noise gives them.
+    Losses are relative to the lowest one. Parameters are compared with those of the lowest loss, in
+    their standard deviations due to the noise.
     """
     rows = each_afresh(measured, [Job(one, recs, repeats) for one in who], at_once)
     asked = posed(recs)

@@ -1,10 +1,11 @@
-"""Recordings with a mistake in them: none may end as `adequate` or `explained`.
+"""Recordings with a user error: the verdict must not be `adequate` or `explained`.
 
-Robots of the worlds bench (MuJoCo), read with one mistake: a torque's sign, a position in degrees
-or millimetres, the torques of two joints swapped, a clock twice as fast, torque that is noise, a
-joint that stands still, another robot's drawing, or a drive that is at its limit for most of the
-time. The law is unknown. Free bodies absorb some of these: a clock twice as fast is an inertia of a
-quarter. With `--bodies drawn` the bodies are those of the URDF, wrong by up to a quarter.
+Robots of the worlds benchmark (MuJoCo) are read with one error: a wrong sign of torque, a position
+in degrees or millimetres, the torques of two joints swapped, a clock twice as fast, torque that is
+noise, a joint at rest, the URDF of another robot, or a drive that is at its limit for most of the
+time. The law is unknown. Free bodies absorb some of these errors: a clock twice as fast is the same
+as a quarter of the inertia. With `--bodies drawn` the bodies are those of the URDF, wrong by up to
+a quarter.
 
 python -m benchmarks.mistakes [--quick] [--json FILE] [--seed N] [--count 24]
                               [--bodies free|drawn]
@@ -61,7 +62,7 @@ def _still(r: Signals, j: int) -> Signals:
 
 
 def _limited(r: Signals, j: int) -> Signals:
-    """The torque that is logged is the drive's, the motion that of the command."""
+    """The logged torque is limited, the motion is that of the command."""
     most = 0.4 * np.std(r["tau"][:, j])
     tau = r["tau"].copy()
     tau[:, j] = np.clip(tau[:, j], -most, most)
@@ -72,7 +73,7 @@ def _same(r: Signals, j: int) -> Signals:
     return r
 
 
-# By name: what is done to a recording, and words of which one is in a reason that names it.
+# By name: the change of a recording, and words of which a correct reason contains one.
 MISTAKES: dict[str, tuple[Mistake, tuple[str, ...]]] = {
     "sign of torque": (_scaled("tau", -1.0), ("sign",)),
     "degrees or millimetres": (_scaled("q", 57.3), ("in degrees", "in mm")),
@@ -86,18 +87,18 @@ MISTAKES: dict[str, tuple[Mistake, tuple[str, ...]]] = {
 
 
 def broken(case: Case, name: str, joint: int) -> Case:
-    """A case whose recordings all have a mistake."""
+    """A case in which all recordings have an error."""
     change = MISTAKES[name][0]
     recordings = {key: change(r, joint) for key, r in case.recordings.items()}
     return dataclasses.replace(case, recordings=recordings)
 
 
 def run_case(seed: int, number: int, name: str, bodies: str) -> dict[str, Any]:
-    """One case: what the discovery says of it.
+    """The result of a discovery for one case.
 
     **Arguments:**
 
-    - `number`: says which robot and joint. `name`: of the mistake.
+    - `number`: determines robot and joint. `name`: name of the error.
     - `bodies`: "free" or "drawn".
     """
     robots = ("planar", "scara", "gantry", "polar") if name != "torques swapped" else ("planar",)

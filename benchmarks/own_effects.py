@@ -1,6 +1,6 @@
-"""What an effect of one's own costs: a linear solve, a network, eigenvalues in a joint's torque.
+"""Run time of a user's effect: a linear solve, a network or eigenvalues in a joint's torque.
 
-Times of one simulation and of one residual with its Jacobian, and how many times those of the loop
+Times of one simulation and of one residual with its Jacobian, also relative to those of the loop
 without the effect.
 
 python -m benchmarks.own_effects [--quick] [--json FILE]
@@ -52,7 +52,7 @@ def network(width: int, depth: int) -> Callable[[jax.Array], jax.Array]:
 
 
 def eigenvalues(x: jax.Array) -> jax.Array:
-    """Of two by two numbers: a call of LAPACK."""
+    """Eigenvalues of a two by two matrix: a call of LAPACK."""
     return jnp.linalg.eigvalsh(_matrix(x, 2)[0])
 
 

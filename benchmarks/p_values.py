@@ -1,9 +1,9 @@
-"""Whether p-values mean what they say: clean recordings, diagnosed, as often as it takes.
+"""Distribution of p-values on clean recordings.
 
 python -m benchmarks.p_values [--seed N] [--quick] [--json FILE] [--jobs 2]
 
-A robot's motions are simulated once and its noise is drawn several times. Where nothing is
-missing, the smallest corrected p-value of a diagnosis is uniform between 0 and 1.
+A robot's motions are simulated once and its noise is drawn several times. If no effect is missing,
+the smallest corrected p-value of a diagnosis should be uniform between 0 and 1.
 """
 
 import argparse
@@ -33,7 +33,7 @@ QUANTILES = (0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9)
 
 @dataclass(frozen=True)
 class Robot:
-    """One robot with its motions and one colour of noise, and how often its noise is drawn."""
+    """One robot with its motions, one colour of noise, and the number of draws."""
 
     seed: int
     colour: str
@@ -41,7 +41,7 @@ class Robot:
 
 
 def draw_robots(master: int, quick: bool = False) -> list[Robot]:
-    """Robots in turn over the colours of noise."""
+    """Robots, with the colours of noise in turn."""
     rng = np.random.default_rng(master)
     robots, draws = (5, 2) if quick else (25, 8)
     seeds = rng.integers(1, 2**31, robots).tolist()
@@ -50,12 +50,12 @@ def draw_robots(master: int, quick: bool = False) -> list[Robot]:
 
 
 def pairs(robot: Robot) -> list[jaxid.Recordings]:
-    """Clean recordings of one robot, alike but for their noise."""
+    """Clean recordings of one robot that differ only in their noise."""
     case = sim.make_case(robot.seed, (), robot.colour)
     rng = np.random.default_rng([robot.seed, 1])
     made = []
     for _ in range(robot.draws):
-        # The filter is drawn anew as well: all pairs of a robot would else share one.
+        # The filter is also drawn anew; otherwise all pairs of a robot would share one.
         noise = sim.draw_noise(rng, robot.colour, case.plant.joints, case.noise.level)
         signals = []
         for name in FITTING:
@@ -67,13 +67,13 @@ def pairs(robot: Robot) -> list[jaxid.Recordings]:
 
 
 def judge_robot(robot: Robot) -> list[dict[str, Any]]:
-    """The smallest p-value of each pair's diagnosis, and what it belongs to."""
+    """The smallest p-value of each pair's diagnosis, with its hypothesis."""
     rows, loop = [], jaxid.scara()
     for number, recordings in enumerate(pairs(robot)):
         started = time.perf_counter()
         start = "auto" if number == 0 else "given"
         fit = jaxid.fit(loop, recordings, jaxid.OEM(start=start, progress=False))
-        # The same robot under other noise: the next fit has not far to go.
+        # The same robot with other noise, so the next fit starts near its optimum.
         loop = fit.loop
         diagnosis = jaxid.diagnose(fit, progress=False)
         least = min((*diagnosis.ranking, *diagnosis.where), key=lambda v: v.p_value)
@@ -95,7 +95,7 @@ def judge_robot(robot: Robot) -> list[dict[str, Any]]:
 
 
 def summary(table: pd.DataFrame) -> dict[str, Any]:
-    """Fractions and quantiles, all and by colour."""
+    """Fractions and quantiles, in total and by colour."""
     least = table["p"]
     return {
         "pairs": len(table),
@@ -115,7 +115,7 @@ def summary(table: pd.DataFrame) -> dict[str, Any]:
 
 
 def show_summary(result: dict[str, Any]) -> None:
-    """Prints the fractions, with the aim, and the quantiles beside those that they should be."""
+    """Prints the fractions with their goal, and the quantiles with their expected values."""
     print(
         f"{result['below_0.05_percent']:.1f} % of {result['pairs']} pairs below 0.05 (aim 1 to 9 %)"
     )

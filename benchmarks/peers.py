@@ -1,10 +1,10 @@
-"""One simulation, one Jacobian, one whole fit and one start, by jaxid and by its peers.
+"""One simulation, one Jacobian, one whole fit and one start, by jaxid and by other programs.
 
-All do the same: RK4 with four steps in each sampling interval and the same cubic of the reference
-(SciPy: an adaptive solver at a tolerance that gives the same accuracy). MuJoCo has no arctan
+All solve the same problem: RK4 with four steps in each sampling interval and the same cubic of the
+reference (SciPy: an adaptive solver with a tolerance for the same accuracy). MuJoCo has no arctan
 friction and no reference between steps, so its numbers are for a model of the same size; its
-Jacobian is by finite differences over `mujoco.rollout`, as in its sysid toolbox. A peer that is not
-installed is left out.
+Jacobian is by finite differences over `mujoco.rollout`, as in its sysid toolbox. A program that is
+not installed is left out.
 
 python -m benchmarks.peers [--quick] [--json FILE]
 """
@@ -48,7 +48,7 @@ from ._problem import (
 
 @dataclasses.dataclass(frozen=True)
 class Ended:
-    """A whole fit: the estimate, seconds warm and cold, and what was evaluated on the way."""
+    """A whole fit: the estimate, seconds warm and cold, and numbers of evaluations."""
 
     theta: np.ndarray
     warm: float
@@ -83,7 +83,7 @@ def fitted(peer: Peer, recs: jaxid.Recordings, repeats: int) -> Ended:
 
 
 def fitted_by_jaxid(recs: jaxid.Recordings, repeats: int) -> tuple[Ended, np.ndarray]:
-    """`jaxid.fit` with all that it does, and the deviations that it reports."""
+    """A complete `jaxid.fit`, and its deviations."""
     loop, counts = cad(), {"simulations": 0, "jacobians": 0}
 
     def counted(kind: str, fun: Callable[..., Any]) -> Callable[..., Any]:
@@ -109,7 +109,7 @@ def fitted_by_jaxid(recs: jaxid.Recordings, repeats: int) -> tuple[Ended, np.nda
 
 
 def minimised_by_jaxid(recs: jaxid.Recordings, repeats: int) -> Ended:
-    """What the peers do, no more: one minimisation from the CAD start with known weights."""
+    """Only the minimisation, like the other programs: from the CAD start with known weights."""
     loop = cad()
     batch = prepare(loop, recs)
     asked = dataclasses.replace(problem(loop, batch), weights=jnp.full(2, 1 / NOISE))
@@ -121,7 +121,7 @@ def minimised_by_jaxid(recs: jaxid.Recordings, repeats: int) -> Ended:
 
 
 def main() -> None:
-    """Prints what was measured, one table."""
+    """Prints all measurements as one table."""
     given = options(__doc__)
     seconds, count, budget = (2.0, 4, 3.0) if given.quick else (20.0, 64, 60.0)
     print(machine())
@@ -176,7 +176,7 @@ def _relative(a: Any, b: np.ndarray) -> float:
 
 
 def whole_fits(seconds: float, quick: bool) -> list[dict[str, Any]]:
-    """A fit of two recordings from the CAD start: seconds, and whether it got there."""
+    """A fit of two recordings from the CAD start: seconds, and distance from the optimum."""
     recs, repeats = recordings(2, seconds), 5 if quick else 3
     ours, deviations = fitted_by_jaxid(recs, 2 * repeats)
     best = {"jaxid": ours, "jaxid, minimisation alone": minimised_by_jaxid(recs, 2 * repeats)}
@@ -203,7 +203,7 @@ def whole_fits(seconds: float, quick: bool) -> list[dict[str, Any]]:
 
 
 def cold_starts(turns: int = 3) -> list[dict[str, Any]]:
-    """Seconds from starting Python to the printed table of `jaxid fit`, beside bare imports."""
+    """Seconds from the start of Python to the table of `jaxid fit`, and of imports alone."""
     files = sorted(str(f) for f in (Path(jaxid.__file__).parent / "demo" / "clean").glob("fit_*"))
     command = "from jaxid.cli import main; main()"
     imports, filled = "imports of jax, diffrax, optimistix", "jaxid fit, filled cache"

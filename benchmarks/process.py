@@ -1,9 +1,9 @@
-"""What each setting that jaxid makes in its process is worth: seconds of compiling, time of a run.
+"""The benefit of each setting that jaxid makes in its process: compilation time and run time.
 
-Every row is a process of its own without a cache of compiled programs. `first_s` is the processor
-time of a first call, all threads together, and holds tracing and compiling; `run_ms` is the
-wall-clock time of a call after that. Both are the least of several processes taken in turns, and
-`first` and `run` their ratios to jaxid's own settings.
+Every row is a separate process without a cache of compiled programs. `first_s` is the processor
+time of a first call over all threads, including tracing and compilation. `run_ms` is the wall-clock
+time of a later call. Both are the smallest of several processes run in turns; `first` and `run` are
+the ratios to jaxid's own settings.
 
 python -m benchmarks.process [--quick] [--json FILE]
 """
@@ -27,7 +27,7 @@ from jaxid.simulation.batch import prepare
 from ._output import options, report
 from ._problem import cad, interleaved, machine, problem, recordings, truth
 
-# What a user would set to have a process without the one, the other, or both.
+# Environment variables that disable one setting, the other, or both.
 OPTIONS = (
     "--xla_backend_optimization_level=3 --xla_cpu_use_fusion_emitters=true "
     "--xla_cpu_parallel_codegen_split_count=32"
@@ -62,7 +62,7 @@ def measure(seconds: float, budget: float, diagnosed: bool) -> None:
         tasks["diagnosis"] = lambda: jaxid.diagnose(found_fit)
     found = {}
     for task, fun in tasks.items():
-        # Each is timed as the first of its process: what the others compiled is forgotten.
+        # Each is timed like the first of its process; programs of the others are cleared.
         jax.clear_caches()
         started = time.process_time()
         jax.block_until_ready(fun())
@@ -75,7 +75,7 @@ def measure(seconds: float, budget: float, diagnosed: bool) -> None:
 def with_settings(
     setting: str, seconds: float, budget: float, diagnosed: bool
 ) -> dict[str, dict[str, float]]:
-    """What a fresh process with these settings measures."""
+    """The measurements of a new process with these settings."""
     ours = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAXID_SET_XLA_FLAGS")}
     code = f"from benchmarks.process import measure; measure({seconds}, {budget}, {diagnosed})"
     out = subprocess.run(

@@ -1,8 +1,8 @@
-"""Measured six-joint arms, from their files: what a rigid arm lacks, and what `discover` says.
+"""Measured six-joint arms: rigid models, models with the missing effect, and `discover`.
 
-KUKA KR300 (Weigand et al. 2021): bodies as drawn, fitted on recording A, judged on B; the
-counterbalance at joint 2 is what it lacks. Stäubli TX40 (FIGAROH): fitted on the first 5 s, judged
-on the rest; the shaft that joints 5 and 6 share is what it lacks.
+KUKA KR300 (Weigand et al. 2021): bodies as drawn, fitted on recording A, tested on B; the model
+lacks the counterbalance at joint 2. Stäubli TX40 (FIGAROH): fitted on the first 5 s, tested on the
+remaining time; the model lacks the shaft that joints 5 and 6 share.
 
 python -m benchmarks.real_arms [--quick] [--json FILE]
 """
@@ -22,7 +22,7 @@ from jaxid.effects import AbstractEffect, Counterbalance, SharedShaft, Spring
 from ._output import options, records, show, write
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
-# As the figures that are published with the recordings: 5 Hz, and 100 Hz before rows are thinned.
+# As in the published figures: 5 Hz, and 100 Hz before rows are thinned.
 KR300_CUTOFF, TX40_CUTOFF, TX40_EVERY = 5.0, 100.0, 20
 
 
@@ -41,12 +41,12 @@ def kr300() -> tuple[jaxid.ClosedLoop, jaxid.Recording, jaxid.Recording]:
 
 
 def tx40(bodies: str) -> tuple[jaxid.ClosedLoop, jaxid.Recording, jaxid.Recording, jaxid.Recording]:
-    """The arm with its gears; all of the recording, the first 5 s and the rest of it."""
+    """The arm with its gears; the whole recording, its first 5 s, and the remaining time."""
     with np.load(DATA / "tx40" / "tx40.npz") as found:
         signals = {name: found[name] for name in ("dt", "q", "tau", "G")}
     step = float(signals["dt"])
     low = scipy.signal.butter(4, TX40_CUTOFF, fs=1 / step, output="sos")
-    # The file's zero is not the robot's.
+    # The zero positions of the file differ from those of the robot.
     q = signals["q"] + np.array([0, -np.pi / 2, np.pi / 2, 0, 0, 0])
     q, tau = (scipy.signal.sosfiltfilt(low, x, axis=0)[::TX40_EVERY] for x in (q, signals["tau"]))
     at = np.arange(len(q)) * step * TX40_EVERY
@@ -66,7 +66,7 @@ def row(
     unseen: jaxid.Recording | None = None,
     effect: AbstractEffect | None = None,
 ) -> dict[str, float]:
-    """Torque error by joint of a fit, on its recording and on one that it has not seen, %."""
+    """Torque error by joint of a fit, on its recording and on a held-out one, %."""
     started = time.perf_counter()
     fit = jaxid.fit(loop if effect is None else loop.add(effect), fitting)
     found = {f"{j} fit": float(x) for j, x in enumerate(fit.error_percent.iloc[0], start=1)}
@@ -84,7 +84,7 @@ def unseen_error(comparison: jaxid.Comparison) -> dict[str, float]:
 def fits(quick: bool) -> pd.DataFrame:
     """One row for each model: torque error by joint, %."""
     loop, a, b = kr300()
-    # A spring's preload is the offset.
+    # The preload of a spring is the offset.
     sprung = loop.without("torque_offset", 2)
     rows = {
         ("KR300", "bodies as drawn"): row(loop, a, b),
@@ -104,7 +104,7 @@ def fits(quick: bool) -> pd.DataFrame:
 
 
 def discoveries() -> pd.DataFrame:
-    """One row for each step of a discovery: torque error by joint on what it has not seen, %."""
+    """One row for each step of a discovery: torque error by joint on held-out data, %."""
     rows: dict[tuple[str, str], dict[str, object]] = {}
     loop, a, b = kr300()
     shafted, _, first, rest = tx40("drawn")

@@ -1,4 +1,4 @@
-"""How well a fit finds the truth: a simulated SCARA, 20 times another arm and other motions.
+"""Accuracy of fits: 20 simulated SCARAs with random parameters and motions.
 
 Each draw: base parameters within 12 % of the published ones, two recordings of 20 s by the
 independent simulator of tests/independent, encoders of 40 000 counts, coloured torque noise of
@@ -55,7 +55,7 @@ def table(draws: int = DRAWS) -> pd.DataFrame:
 
 
 def main() -> None:
-    """Prints the table, and the deviations' own deviation: 1 where they are honest."""
+    """Prints the table, and the root mean square error in deviations: 1 if these are correct."""
     given = options(__doc__)
     found = table(3 if given.quick else DRAWS)
     report(found, given.json, ".2f")

@@ -1,11 +1,11 @@
-"""What happens to long work: killed, interrupted, and large.
+"""Long computations that are killed, interrupted, or large.
 
 python -m benchmarks.reliability [--part kills|interrupts|size] [--quick] [--json FILE]
 
 kills: bootstrap draws of a regression as a campaign, ended by SIGKILL at 50 random moments and
-begun again each time; held against an undisturbed run, to the bit. interrupts: Ctrl-C at random
-moments of `jaxid fit`, and how long until the prompt is back. size: 1024 recordings of 20 s in one
-fit, and 10 000 draws of its residuals through its Jacobian; peak memory, time.
+restarted each time; the result must be bit-identical to an undisturbed run. interrupts: Ctrl-C at
+random moments of `jaxid fit`, and the time until the process ends. size: 1024 recordings of 20 s in
+one fit, and 10 000 bootstrap draws by its Jacobian; peak memory and time.
 """
 
 import argparse
@@ -45,7 +45,7 @@ def _regression(rows: int = 400, columns: int = 8) -> tuple[np.ndarray, np.ndarr
 
 
 def _draws(piece: int, size: int = 200) -> dict[str, Any]:
-    """A few bootstrap draws of a regression, all from the piece's own seed."""
+    """A few bootstrap draws of a regression, from the piece's own seed."""
     x, y = _regression()
     rng = np.random.default_rng([7, piece])
     found = []
@@ -66,7 +66,7 @@ def _work(folder: Path | None, pieces: int, log: int | None) -> Iterator[tuple[s
 
 
 def _wait_for_work(process: int, seconds: float) -> None:
-    """Until a process has worked that long, however busy the machine is, or is gone."""
+    """Waits until a process has used that much processor time, or has ended."""
     while True:
         with open(f"/proc/{process}/schedstat", encoding="ascii") as file:
             worked = int(file.read().split()[0]) / 1e9
@@ -83,7 +83,7 @@ def _digest(found: Iterator[tuple[str, Any]]) -> str:
 
 
 def kills(quick: bool) -> dict[str, Any]:
-    """Ends a campaign at random moments, and counts what was lost and done twice."""
+    """Ends a campaign at random moments, and counts lost and repeated pieces."""
     times, pieces = (8, 40) if quick else (50, 200)
     seed = secrets.randbits(31)
     moments = random.Random(seed)
@@ -92,7 +92,7 @@ def kills(quick: bool) -> dict[str, Any]:
     log = os.open(log_path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     done, ended_early = 0, 0
     while done < times:
-        # Begun anew where the whole of it got done before it was killed often enough.
+        # Restarted if it finished before it was killed often enough.
         target = folder / f"campaign_{ended_early}"
         child = os.fork()
         if child == 0:
@@ -117,7 +117,7 @@ def kills(quick: bool) -> dict[str, Any]:
         "killed": done,
         "campaigns": ended_early + 1,
         "pieces": pieces,
-        # What is begun more often than it was finished died in the middle.
+        # Pieces that were begun more often than finished were interrupted.
         "begun": begun,
         "finished": sum(before),
         "pieces_at_the_end": [len(list(one.glob("*.piece"))) for one in folders],
@@ -129,22 +129,22 @@ def kills(quick: bool) -> dict[str, Any]:
 
 
 def interrupts(quick: bool) -> dict[str, Any]:
-    """Sends Ctrl-C to `jaxid fit` at random moments, and measures until it is gone."""
+    """Sends Ctrl-C to `jaxid fit` at random moments, and measures the time until it ends."""
     command = [sys.executable, "-c", "from jaxid.cli import main; main()", "fit"]
     command += [str(DEMO / f"fit_{k}.csv") for k in (1, 2)]
-    # A shell's background jobs are deaf to Ctrl-C, and so is what they start.
+    # Background jobs of a shell ignore Ctrl-C, and so do their child processes.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     seed = secrets.randbits(31)
     moments = random.Random(seed)
     waits, codes = [], []
     with tempfile.TemporaryDirectory() as cache:
-        # Without compiled programs from before, most moments are ones of a compiler at work.
+        # Without cached programs, most interrupts happen during compilation.
         settings = os.environ | {"JAX_COMPILATION_CACHE_DIR": cache}
         for _ in range(3 if quick else 20):
             process = subprocess.Popen(
                 command, env=settings, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
             )
-            # The first second belongs to Python, which knows Ctrl-C by itself.
+            # In the first second Python itself handles Ctrl-C.
             time.sleep(moments.uniform(1.0, 15.0))
             if process.poll() is not None:
                 continue
@@ -166,7 +166,7 @@ def interrupts(quick: bool) -> dict[str, Any]:
 
 
 def size(quick: bool) -> dict[str, Any]:
-    """Fits many recordings at once; each is a simulated one with noise of its own."""
+    """Fits many simulated recordings at once, each with its own noise."""
     count, seconds, draws = (16, 5.0, 500) if quick else (1024, 20.0, 10_000)
     case = sim.make_case(41, duration=seconds)
     rng = np.random.default_rng(7)
@@ -201,7 +201,7 @@ def size(quick: bool) -> dict[str, Any]:
 
 
 def _recording_bootstrap(fit: jaxid.Fit, draws: int) -> np.ndarray:
-    """Spread of the estimate when recordings are drawn with replacement, one Newton step each."""
+    """Spread of the estimate for recordings drawn with replacement, with one Newton step each."""
     grams, slopes = [], []
     for recording in fit.recordings:
         gram, slope = _normal_equations(fit, recording)

@@ -1,7 +1,7 @@
-"""Time and memory against recordings, their length, parameters, hypotheses and devices.
+"""Time and memory over the number and length of recordings, parameters, hypotheses and devices.
 
-`us_per_step` is the time of one weighted residual with its Jacobian (what a fit repeats), divided
-by the number of steps; for hypotheses it is the response of the linearised loop to each.
+`us_per_step` is the time of one weighted residual with its Jacobian (the repeated part of a fit),
+divided by the number of steps; for hypotheses it is the response of the linearised loop to each.
 
 python -m benchmarks.scaling [--quick] [--json FILE]
 """
@@ -52,7 +52,7 @@ def calls(cases: dict[tuple, tuple[jaxid.ClosedLoop, Batch]]) -> dict[tuple, Any
 
 
 def grow(name: str, cases: dict[tuple, tuple[jaxid.ClosedLoop, Batch]], budget: float) -> list:
-    """Rows of one family of cases, timed side by side."""
+    """Rows of one family of cases, timed in turns."""
     best = interleaved(calls(cases), budget, most=30)
     rows = []
     for key, seconds in best.items():
@@ -74,7 +74,7 @@ def grow(name: str, cases: dict[tuple, tuple[jaxid.ClosedLoop, Batch]], budget: 
 
 
 def repeated(batch: Batch, count: int) -> Batch:
-    """A batch of one recording, many times: what differs between them does not matter to time."""
+    """A batch of one recording, repeated; differences between recordings do not affect the time."""
     return jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), batch)
 
 
@@ -102,7 +102,7 @@ def hypotheses(batch: Batch, counts: tuple[int, ...], budget: float) -> list[dic
 
 
 def devices(seconds: float, count: int, turns: int = 3) -> list[dict[str, Any]]:
-    """One host device against two that share the recordings, each in a process of its own."""
+    """One host device compared with two that share the recordings, in separate processes."""
     best: dict[int, dict[str, float]] = {}
     for used in turns * (1, 2):
         flags = os.environ.get("XLA_FLAGS", "")
@@ -124,7 +124,7 @@ def devices(seconds: float, count: int, turns: int = 3) -> list[dict[str, Any]]:
 
 
 def shared(seconds: float, count: int) -> None:
-    """Prints the time of a Jacobian that all devices of this process share."""
+    """Prints the time of a Jacobian on all devices of this process."""
     batch = repeated(prepare(cad(), recordings(1, seconds)), count)
     mesh = jax.sharding.Mesh(np.array(jax.devices()), ("recordings",))
     around = linearisation(problem(truth(), batch, mesh))

@@ -1,9 +1,9 @@
-"""What screening costs beside what it replaces, as ratios within one run.
+"""Duration of screening, compared with the refits that it replaces, as ratios within one run.
 
 python -m benchmarks.screening [--quick] [--json FILE]
 
-Two recordings of 20 s of a simulated SCARA with one hidden effect (`tests/independent`). One
-Jacobian of the output error with 8 parameters is the unit. Everything is warm: compiled before.
+Two recordings of 20 s of a simulated SCARA with one hidden effect (`tests/independent`). The unit
+is one Jacobian of the output error with 8 parameters. Everything is compiled before.
 """
 
 import time
@@ -40,7 +40,7 @@ def recorded() -> jaxid.Recordings:
 
 
 def least(task: Callable[[], Any], repeats: int) -> float:
-    """The shortest of several runs, s: what the task costs where nothing else disturbs it."""
+    """The shortest of several runs, s, which is least disturbed by other work."""
     task()
     times = []
     for _ in range(repeats):

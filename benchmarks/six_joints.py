@@ -1,14 +1,14 @@
-"""Arms of six and seven joints under an unknown law: is the hidden effect named?
+"""Hidden effects on arms of six and seven joints under an unknown law.
 
 Published URDFs (Universal Robots, Unitree Z1, Kinova, Panda without its fingers) are simulated by
 MuJoCo under a law that is computed at 1 kHz from quantised encoders. One effect is hidden, or none.
-The user has the URDF, the rotors' data sheet, two recordings of 10 s to fit and one to judge, and
+The user has the URDF, the rotors' data sheet, two recordings of 10 s to fit and one to test, and
 does not know the law.
 
-A body at the tip is a part of the last link: on all recordings it shows only where the links are
-held as drawn, and where they are estimated it is hidden in one recording alone. So are a rotor and
-a counterbalance a part of what is estimated, and are hidden from held links. Links that are
-estimated are drawn wrong by up to a fifth.
+A body at the tip is a part of the last link. It can be identified on all recordings only if the
+links are held as drawn; if they are estimated, it is hidden in one recording only. Rotors and
+counterbalances would also be absorbed by estimated links, so they are hidden only with held links.
+Links that are estimated are drawn wrong by up to a fifth.
 
 python -m benchmarks.six_joints [--seed N] [--count 40] [--quick] [--jobs 1] [--out DIR]
                                 [--case N] [--json FILE]
@@ -59,19 +59,19 @@ EFFECTS = (
     "shared_shaft",
     "counterbalance",
 )
-# What estimated links would swallow.
+# Effects that estimated links would absorb.
 OF_DRAWN = ("rotor_inertia", "counterbalance")
 RATE, DURATION, WRONG = 250, 10.0, 0.2
 NAMES = ("fit_1", "fit_2", "held_out")
 
 
-# What a quick run asks for: the whole catalogue is a thousand signatures.
+# Effects of a quick run; the whole catalogue has a thousand signatures.
 _FEW = jaxid.effects.CarriedBody, jaxid.effects.BaseTilt, jaxid.effects.Stribeck
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a case is to be; no effect where it is clean. `few`: whether few effects are asked."""
+    """Specification of a case; no effect if it is clean. `few`: whether there are few."""
 
     number: int
     seed: int
@@ -82,16 +82,16 @@ class Wanted:
 
     @property
     def label(self) -> str:
-        """For file names and tables."""
+        """Name in files and tables."""
         return f"{self.number:03d}_{self.robot}_{self.bodies}_{self.effect or 'clean'}"
 
 
 @dataclass(frozen=True)
 class Case:
-    """A case as it was made: what the user has, and what is true.
+    """A simulated case: the user's data, and the truth.
 
-    - `joint`: where the effect is, from 1; None for effects of the whole arm.
-    - `size`: of its torque beside that of the noise, root mean square, where it is largest.
+    - `joint`: joint of the effect, from 1; None for effects of the whole arm.
+    - `size`: its torque over the noise, root mean square, on the joint of the largest ratio.
     """
 
     loop: jaxid.ClosedLoop
@@ -102,7 +102,7 @@ class Case:
 
 
 def draw_wanted(master: int, count: int) -> list[Wanted]:
-    """`count` cases: one of five clean, the others with one effect."""
+    """`count` cases: one in five clean, the others with one effect."""
     rng = np.random.default_rng(master)
     found = []
     for number in range(count):
@@ -147,7 +147,7 @@ def make(wanted: Wanted) -> Case:
 
 
 def _model(urdf: str, tip: str, rotors: Sequence[float], bodies: str) -> jaxid.ClosedLoop:
-    """What a user writes who takes the drives to have no offsets, and trusts the data sheet."""
+    """The model of a user who assumes drives without offsets and the rotors of the data sheet."""
     loop = jaxid.serial(urdf, rotors=rotors, bodies=bodies, tip=tip)
     for j in range(1, loop.joints + 1):
         loop = loop.without("torque_offset", j).hold(f"Ia{j}")
@@ -176,7 +176,7 @@ def _motions(rng: np.random.Generator, plant: Plant) -> tuple[np.ndarray, list[R
 def _drive(
     rng: np.random.Generator, plant: Plant, reference: Reference, home: np.ndarray
 ) -> tuple[Plant, np.ndarray]:
-    """The plant with rotors and friction, and how large its joints' torques are, N·m."""
+    """The plant with rotors and friction, and the size of its joints' torques, N·m."""
     import mujoco
 
     model = plant.model()
@@ -231,7 +231,7 @@ def _hide(
     one = replace(plant, extra=((wanted.effect, j, {**numbers, "size": 1.0}),))
     rows = zip(q.tolist(), _speeds(reference).tolist(), through.tolist(), strict=True)
     plain = np.sqrt(np.mean(np.array([one.unseen(*row) for row in rows]) ** 2, axis=0))
-    # Five to twenty times the noise before anything makes up for it.
+    # Five to twenty times the noise before parameters absorb a part.
     times = math.exp(rng.uniform(math.log(5), math.log(20)))
     numbers["size"] = float(times * level[j] / plain[j])
     made = replace(plant, extra=((wanted.effect, j, numbers),))
@@ -241,7 +241,7 @@ def _hide(
 def _numbers(
     rng: np.random.Generator, wanted: Wanted, reference: Reference, j: int
 ) -> dict[str, float]:
-    """The numbers that give an effect its shape."""
+    """The shape parameters of an effect."""
     uniform, speed = rng.uniform, float(np.abs(_speeds(reference)).max(axis=0)[j])
     match wanted.effect:
         case "payload":
@@ -267,7 +267,7 @@ def _numbers(
 
 
 def _recorded(rng: np.random.Generator, run: Run, level: np.ndarray, name: str) -> jaxid.Recording:
-    """The run as it was logged, with noise in its torque."""
+    """The logged run, with noise in its torque."""
     every = round(1000 / RATE)
     tau = run.tau[::every]
     noise = level * rng.standard_normal(tau.shape)
@@ -275,7 +275,7 @@ def _recorded(rng: np.random.Generator, run: Run, level: np.ndarray, name: str) 
 
 
 def run_case(wanted: Wanted) -> dict[str, Any]:
-    """Makes, solves and judges one case."""
+    """Makes, solves and marks one case."""
     started = time.perf_counter()
     try:
         record = _solve(wanted)
@@ -308,9 +308,9 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
 
 
 def judge(wanted: Wanted, joint: int | None, story: dict[str, Any]) -> dict[str, Any]:
-    """What was right of a story: the first effect with its joint; nothing, where it is clean.
+    """The marks of a story: the first effect with its joint, or none for a clean case.
 
-    Shared is a first place that the weight is shared for, between this effect and another.
+    A first place is shared if another effect shares its weight.
     """
     added = [(a["effect"], a["joint"]) for a in story["added"]]
     marks: dict[str, Any] = {"verdict": story["verdict"], "added": added}

@@ -1,8 +1,9 @@
-"""What people do today: stepwise regression on filtered derivatives, with jaxid's own catalogue.
+"""Stepwise regression on filtered derivatives, with jaxid's own catalogue, as a baseline.
 
-The motion is low-passed without delay and differentiated, every effect of the catalogue gives the
-torque that it would need along that motion, and columns enter one effect at a time by BIC while an
-F-test lets them. Elasticity and backlash have no torque along a measured motion: they stay out.
+The motion is low-passed without delay and differentiated. Every effect of the catalogue gives the
+torque that it would need along that motion. Columns enter one effect at a time by BIC while an
+F-test accepts them. Elasticity and backlash have no torque along a measured motion and are left
+out.
 """
 
 from collections.abc import Sequence
@@ -24,13 +25,13 @@ from jaxid.simulation.dynamics import inverse
 from jaxid.simulation.runs import Simulated
 
 Key = tuple[str, int | None]
-# A column of which the others leave less than this share says nothing.
+# A column with less than this share beyond the others is ignored.
 WEAK = 1e-6
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One effect that entered: its key, the p-value with which it did, and its block's place."""
+    """One effect that was selected: its key, its p-value, and the place of its block."""
 
     key: Key
     p_value: float
@@ -39,7 +40,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of all recordings, each joint's over its deviation: base columns, candidates, torque."""
+    """Rows of all recordings, scaled by each joint's deviation: base, candidates, torque."""
 
     base: np.ndarray
     blocks: list[np.ndarray]
@@ -50,7 +51,7 @@ class Rows:
 def first_effect(
     loop: jaxid.ClosedLoop, recordings: jaxid.Recordings, p_to_enter: float = 0.01
 ) -> Key | None:
-    """The effect that enters first, with its joint; None where nothing enters."""
+    """The effect that is selected first, with its joint; None if none is selected."""
     entered = select(loop, recordings, p_to_enter, most=1)
     return entered[0].key if entered else None
 
@@ -66,7 +67,7 @@ def select(
 
 
 def forward(rows: Rows, p_to_enter: float = 0.01, most: int = 6) -> list[Entry]:
-    """Forward selection among the blocks of rows, whatever they stand for."""
+    """Forward selection among blocks of columns."""
     basis = _basis(rows.base)
     entered: list[Entry] = []
     while len(entered) < most:
@@ -101,7 +102,7 @@ def _enter(rows: Rows, basis: np.ndarray) -> tuple[Entry | None, np.ndarray]:
 
 
 def _basis(columns: np.ndarray, beside: np.ndarray | None = None) -> np.ndarray:
-    """An orthonormal basis of columns, without what another basis holds."""
+    """An orthonormal basis of columns, orthogonal to another basis."""
     size = np.linalg.norm(columns, axis=0)
     columns = columns[:, size > 0] / size[size > 0]
     if beside is not None:
@@ -116,7 +117,7 @@ def _basis(columns: np.ndarray, beside: np.ndarray | None = None) -> np.ndarray:
 
 
 def settle(recordings: jaxid.Recordings) -> jaxid.Filtering:
-    """The filter by the spectra's own cutoffs; at a tenth of the rate where these are too low."""
+    """The filter with the cutoffs of the spectra, or a tenth of the rate if these are too low."""
     try:
         for recording in recordings:
             jaxid.Filtering().settled(recording)
@@ -126,7 +127,7 @@ def settle(recordings: jaxid.Recordings) -> jaxid.Filtering:
 
 
 def assemble(loop: jaxid.ClosedLoop, recordings: jaxid.Recordings) -> Rows:
-    """Base and candidate columns along the filtered motion, all filtered alike and decimated."""
+    """Base and candidate columns along the filtered motion, all with the same filter, decimated."""
     filtering = settle(recordings)
     reducers = [decimator(r, filtering) for r in recordings]
     motions = [filtered(r, filtering) for r in recordings]
@@ -161,7 +162,7 @@ def _flat(x: np.ndarray) -> np.ndarray:
 
 
 def proposed(scene: fx.Scene) -> list[fx.AbstractEffect]:
-    """The catalogue's settings worth trying, without what gives way between drive and link."""
+    """The catalogue's settings to screen, without transmissions."""
     kinds = [kind for kind in fx.catalogue if not issubclass(kind, fx.AbstractTransmission)]
     return [effect for kind in kinds for effect in kind.screened(scene)]
 
@@ -223,9 +224,9 @@ def _tones(residuals, recordings, reducers, most: int = 4) -> list[list[float]]:
 def columns(
     loop: jaxid.ClosedLoop, effect: fx.AbstractEffect, recording: jaxid.Recording, motion: Simulated
 ) -> np.ndarray:
-    """What torque the command would need for one effect, by amplitude, `(samples, joints, ...)`.
+    """Commanded torque that one effect would need, by amplitude, `(samples, joints, ...)`.
 
-    A lag and a delay act on the torque itself: by its slope and by its shift.
+    A lag and a delay act on the torque itself: by its derivative and by a shift.
     """
     if isinstance(effect, (fx.ActuatorLag, fx.TimeDelay)):
         return _late(effect, np.asarray(motion.time), np.asarray(motion.tau))
@@ -275,7 +276,7 @@ def _needed(loop: jaxid.ClosedLoop, effect: fx.AbstractEffect, at: fx.Motion) ->
 
 
 def _behind_sensor(effect: fx.AbstractEffect, measured: fx.Motion) -> fx.Motion:
-    """The motion that a sensor with this effect would have read as the measured one."""
+    """The motion that a sensor with this effect would read as the measured one."""
 
     def true(q):
         return 2 * q - effect.read(q)

@@ -1,4 +1,4 @@
-"""The worlds bench: robots that MuJoCo simulates, with physics and laws that jaxid does not have.
+"""The worlds benchmark: robots simulated by MuJoCo, with physics and laws that jaxid does not have.
 
 Robots of one and two joints are drawn (planar, SCARA, polar, gantry, axis, pendulum) with the
 friction's sign by tanh, a root, arctan or dry, a law held at 1 kHz from quantised encoders, and
@@ -38,7 +38,7 @@ Key = tuple[str, int | None]
 
 
 def run_case(wanted: Wanted, seed: int) -> dict[str, Any]:
-    """Makes, solves and judges one case of the bench with this seed."""
+    """Makes, solves and marks one case of the benchmark with this seed."""
     started = time.perf_counter()
     try:
         record = _solve(wanted)
@@ -70,9 +70,9 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
 
 
 def judge(case: Case, kind: str, story: dict[str, Any], floor: np.ndarray) -> dict[str, Any]:
-    """What was right of a story.
+    """The marks of a story.
 
-    Named is an effect that was added, or that shares the weight with one that was.
+    An effect is named if it was added, or shares the weight with an added one.
     """
     groups = [
         [(a["effect"], a["joint"])] + [(i["effect"], i["joint"]) for i in a["indistinguishable"]]
@@ -96,12 +96,12 @@ def judge(case: Case, kind: str, story: dict[str, Any], floor: np.ndarray) -> di
 
 
 def names_right(groups: Sequence[Sequence[Key]], true: Sequence[Key]) -> dict[str, Any]:
-    """Whether the first name is right, which of the true effects are named, and how many names
-    are of nothing that is there.
+    """Whether the first name is right, which of the true effects are named, and the number of
+    wrong names.
 
     **Arguments:**
 
-    - `groups`: what was found, each with what it could not be told from.
+    - `groups`: added effects, each with its indistinguishable alternatives.
     """
     return {
         "first": bool(groups) and groups[0][0] in true,
@@ -214,7 +214,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(row(record), flush=True)
             records.append(record)
             if file is not None:
-                # Pieces of a folder that was begun before dates were noted have none.
+                # Pieces of older folders have no dates.
                 append(
                     file, line_of({"run": {"seed": seed, "date": None, "commit": None}, **record})
                 )

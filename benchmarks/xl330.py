@@ -1,10 +1,10 @@
-"""A hobby servo with a pendulum (XL330, measured): models of its friction, and what is missing.
+"""A hobby servo with a pendulum (XL330, measured): friction models, and a discovery.
 
-Mean absolute position error over twelve recordings, simulated over all of each from its first
-sample, of the five models of friction of the recordings' README: fitted by least squares, and from
-there by Nelder and Mead's method on that error itself, as the README's figures are. Then `discover`
-from M1 on the recordings at kp 100 and 800, judged on those at kp 400. Then the models said in a
-simulator's terms.
+The five models of friction are those of the recordings' README. Each is fitted by least squares,
+and then by the method of Nelder and Mead on the error itself, as in the README. The error is the
+mean absolute position error over twelve recordings, each simulated from its first sample to its
+end. Then `discover` starts from M1 on the recordings at kp 100 and 800, tested on those at kp 400.
+Finally the models are expressed in a simulator's parameters.
 
 python -m benchmarks.xl330 [--quick] [--json FILE]
 """
@@ -22,11 +22,11 @@ from jaxid.effects import GearFriction
 from ._output import options, records, show, write
 from ._xl330 import error_mrad, models, recordings
 
-# Of the README, own fits at the nominal voltage.
+# Errors in the README, fits at the nominal voltage.
 README = {"M1": 59.5, "M2": 58.4, "M3": 45.8, "M4": 35.7, "M5": 34.6}
-# Which model each is fitted from.
+# The model from which each fit starts.
 FROM = {"M2": "M1", "M3": "M1", "M4": "M3", "M5": "M4"}
-# The sign of velocity, rad/s: a fit of stuck arms needs some width, a figure as little as may be.
+# Width of the sign of velocity, rad/s, for fits (stuck arms need some width) and for the error.
 SHARP, EVALUATIONS = 0.003, 200
 METHOD = jaxid.OEM(start="given", initial="rest", max_steps=40, progress=False)
 
@@ -37,7 +37,7 @@ def started(loop: jaxid.ClosedLoop, before: jaxid.ClosedLoop | None) -> jaxid.Cl
         return loop
     known = dict(zip(before.names, map(float, before.theta), strict=True))
     both = {name: value for name, value in known.items() if name in loop.names}
-    # What M5 tells apart is alike in M4.
+    # Parameters that differ in M5 are equal in M4.
     twins = {"Ke1": "Km1", "Kes1": "Kms1"}
     both |= {new: known[old] for new, old in twins.items() if new in loop.names and old in known}
     return loop.with_values(**both)
@@ -46,7 +46,7 @@ def started(loop: jaxid.ClosedLoop, before: jaxid.ClosedLoop | None) -> jaxid.Cl
 def polished(
     loop: jaxid.ClosedLoop, given: dict[str, jaxid.Recording], evaluations: int
 ) -> jaxid.ClosedLoop:
-    """The loop at the values of least mean absolute error near its own."""
+    """The loop at the values of smallest mean absolute error near its own."""
     low, high = (
         np.array([getattr(p.declaration, side) for p in loop.free_parameters])
         for side in ("lower", "upper")
@@ -73,7 +73,7 @@ def polished(
 def fits(
     given: dict[str, jaxid.Recording], names: list[str], evaluations: int
 ) -> tuple[pd.DataFrame, dict[str, jaxid.ClosedLoop]]:
-    """A row for each model: its error, mrad, by either way of fitting; and the loops."""
+    """A row for each model: its error, mrad, by both methods of fitting; and the loops."""
     rows: dict[str, dict[str, float]] = {}
     squares: dict[str, jaxid.ClosedLoop] = {}
     best: dict[str, jaxid.ClosedLoop] = {}
@@ -97,12 +97,12 @@ def fits(
 
 
 def mean(errors: dict[str, float]) -> float:
-    """Of the recordings, mrad."""
+    """Mean over the recordings, mrad."""
     return float(np.mean(list(errors.values())))
 
 
 def discovery(given: dict[str, jaxid.Recording]) -> pd.DataFrame:
-    """A row for each step of a discovery from M1: position error of kp 400, not seen, mrad."""
+    """A row for each step of a discovery from M1: position error at kp 400, held out, mrad."""
     seen = [r for name, r in given.items() if "kp400" not in name]
     unseen = {name: r for name, r in given.items() if "kp400" in name}
     story = jaxid.discover(
@@ -122,7 +122,7 @@ def discovery(given: dict[str, jaxid.Recording]) -> pd.DataFrame:
 
 
 def in_terms(loop: jaxid.ClosedLoop, given: dict[str, jaxid.Recording]) -> pd.DataFrame:
-    """A row for each choice of a simulator's user: the position error that it leaves, mrad."""
+    """A row for each choice of a simulator's parameters: its position error, mrad."""
     said = jaxid.simulator_terms(loop, list(given.values()), method=METHOD)
     print(said, "\n")
     rows = {choice: mean(error_mrad(one, given)) for choice, one in said.loops.items()}

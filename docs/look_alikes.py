@@ -26,9 +26,9 @@ Motion = Callable[[np.ndarray], np.ndarray]
 
 
 class Pair(NamedTuple):
-    """An effect that is in the recordings, one that may be taken for it, and two motions.
+    """An effect in the recordings, another effect that looks like it, and two motions.
 
-    What is given as an effect is screened at its own shape, a class on its grid.
+    An effect is screened with its own shape, a class with the shapes of its grid.
     """
 
     there: AbstractEffect
@@ -39,7 +39,7 @@ class Pair(NamedTuple):
 
 
 def waves(size: float, *hertz: float) -> Motion:
-    """Sines of equal size, in rad, with phases of their own; from rest at zero."""
+    """Sines of equal amplitude (rad) and different phases, from rest at zero."""
     phases = np.linspace(0, 2, len(hertz))
 
     def along(t: np.ndarray) -> np.ndarray:
@@ -50,7 +50,7 @@ def waves(size: float, *hertz: float) -> Motion:
 
 
 def turning(speed: float, wobble: float = 0.0) -> Motion:
-    """Always one way, at a constant or a varying speed, rad/s."""
+    """Motion in one direction at a constant or a varying speed (rad/s)."""
 
     def along(t: np.ndarray) -> np.ndarray:
         return speed * t - wobble * (np.cos(0.9 * t) - 1)
@@ -121,7 +121,7 @@ def recorded(pair: Pair, motion: Motion) -> jaxid.Recording:
 
 
 def answers(pair: Pair, motion: Motion) -> tuple[Diagnosis, Verdict, Verdict]:
-    """What the effect that is there explains at its best setting, and what the other explains."""
+    """The best verdicts of the effect in the recordings and of the other effect."""
     fit = jaxid.fit(jaxid.scara(), recorded(pair, motion), jaxid.OEM(progress=False))
     shaped = isinstance(pair.other, AbstractEffect)
     there = pair.there.scaled(0.0) if shaped else type(pair.there)
@@ -140,7 +140,7 @@ def kind_of(effect: type[AbstractEffect] | AbstractEffect) -> type[AbstractEffec
 
 
 def explained(found: Diagnosis, verdict: Verdict) -> Float[np.ndarray, " samples"]:
-    """What an effect explains of the residual of joint 2, with the parameters of the fit free."""
+    """The residual of joint 2 that an effect explains, with the fitted parameters free."""
     data, columns = found.data, list(verdict.hypothesis.columns)
     wave = data.table[..., columns] @ found.gram.amplitude(columns)[0]
     weights = 1 / np.sqrt(np.mean(data.residual**2, axis=(0, 1)))
@@ -176,12 +176,12 @@ def draw(pair: Pair) -> go.Figure:
 
 
 def matrix(joint: int = 2) -> go.Figure:
-    """Correlation of all effects of one joint, along the recordings that jaxid brings along."""
+    """Correlation of all effects of one joint, on the recordings that come with jaxid."""
     fit = jaxid.fit(jaxid.scara(), jaxid.read(DEMO / "fit_1.csv", DEMO / "fit_2.csv"))
     found = jaxid.diagnose(fit, progress=False)
     forms = [v for v in found.forms if v.hypothesis.joint == joint]
     values = np.array([[found.correlation(a, b) for b in forms] for a in forms])
-    # Neighbours in the picture are those that look alike.
+    # Effects that look alike are neighbours in the picture.
     order = [0]
     while len(order) < len(forms):
         rest = [k for k in range(len(forms)) if k not in order]

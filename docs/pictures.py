@@ -20,7 +20,7 @@ from jaxid.effects import BaseTilt, CableDrag, CarriedBody, Counterbalance, Curv
 OUT = Path(__file__).parent / "img" / "effects"
 DEMO = Path(jaxid.__file__).parent / "demo" / "clean"
 COORDINATES = ("q", "v", "a", "tau")
-# The arm of the demo as a chain in space: two upright axes, and what its links weigh.
+# The arm of the demo as a chain in space: two vertical axes, and the inertial parameters.
 CHAIN = Chain(
     np.tile(np.eye(3), (2, 1, 1)),
     ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)),
@@ -30,7 +30,7 @@ CHAIN = Chain(
     (0.4, 0.0, 0.0),
 )
 LINKS = ((0.0,) * 6 + (1.0, 0.0, 0.0, 4.0), (0.0,) * 6 + (0.3, 0.0, 0.0, 1.5))
-# Effects that are not proposed for an arm in a plane, as one would show them.
+# Effects that are not proposed for a planar arm, with settings that show them well.
 ELSEWHERE = (
     Counterbalance(joint=2, angle=-1.0),
     SharedShaft(joint=1, driven=2),
@@ -41,7 +41,7 @@ ELSEWHERE = (
 
 
 def main() -> None:
-    """Writes one picture for each class of the catalogue, or for those that are named."""
+    """Writes one picture for each class of the catalogue, or for each class that is named."""
     recordings = jaxid.read(DEMO / "fit_1.csv", DEMO / "fit_2.csv")
     wanted = [e for e in jaxid.catalogue if e.__name__ in (sys.argv[1:] or [e.__name__])]
     catalogue = (*wanted, *(e for e in ELSEWHERE if type(e) in wanted))
@@ -50,7 +50,7 @@ def main() -> None:
     OUT.mkdir(parents=True, exist_ok=True)
     for effect in wanted:
         forms = [v for v in diagnosis.forms if type(v.hypothesis.effect) is effect]
-        # The lighter joint shows most; some effects are on neither or on both.
+        # Effects show most on the lighter joint; some effects have no joint or act on both.
         shown = next((v for v in forms if v.hypothesis.joint == 2), forms[0])
         path = OUT / f"{effect.__name__}.png"
         draw(diagnosis, shown).write_image(path, width=900, height=230, scale=1)
@@ -60,13 +60,12 @@ def main() -> None:
 def waves(
     diagnosis: jaxid.Diagnosis, verdict: Verdict
 ) -> tuple[Float[np.ndarray, "recordings samples 2"], Float[np.ndarray, "recordings samples 2"]]:
-    """The torque that the effect asks for, and what a fit without the effect leaves of it.
+    """The torque of the effect, and its part in the residual of a fit without the effect.
 
-    The fitted parameters change so as to make up for the effect as far as they can; what remains
-    is the residual.
+    The fitted parameters absorb as much of the torque as they can; the rest is the residual.
     """
     data, columns = diagnosis.data, list(verdict.hypothesis.columns)
-    # The first amplitude alone: of a sine and a cosine, one says what both look like.
+    # Only the first amplitude: a sine and a cosine look alike.
     wave = data.table[..., columns[0]]
     size = np.sqrt(np.mean(wave**2, axis=(0, 1))).max()
     weights = 1 / np.sqrt(np.mean(data.residual**2, axis=(0, 1)))
@@ -77,7 +76,7 @@ def waves(
 
 
 def telling(diagnosis: jaxid.Diagnosis, wave: np.ndarray, joint: int) -> tuple[Curve, np.ndarray]:
-    """The coordinate, and whether times the sign of velocity, on which the picture depends most."""
+    """The coordinate on which the torque depends most, with or without the sign of velocity."""
     motion, mask = diagnosis.motion, diagnosis.data.mask
     y = wave[..., joint - 1][mask]
     sign = np.sign(np.asarray(motion.v)[..., joint - 1][mask])
@@ -89,7 +88,7 @@ def telling(diagnosis: jaxid.Diagnosis, wave: np.ndarray, joint: int) -> tuple[C
         for signed in (False, True):
             z = y * sign if signed else y
             rest = sum(np.sum((z[k] - z[k].mean()) ** 2) for k in order)
-            # Plain before signed where both say the same.
+            # The unsigned curve is preferred where both fit about equally well.
             share = 1 - rest / np.sum((z - z.mean()) ** 2) - 0.02 * signed
             if share > best:
                 best, along = share, x

@@ -12,8 +12,8 @@ import jax
 import jax.extend.backend
 import numpy as np
 
-# JAX has no public function for either question. If a later version has moved these functions, the
-# flag is set as if no backend ran. If one does run, the flag has no effect, and XLA's own level
+# JAX has no public functions for these questions. If a later version has moved them, the flag is
+# set as if no backend ran. If a backend does run, the flag has no effect, and XLA's own level
 # stays.
 try:
     from jax._src.core import trace_state_clean as _nothing_is_traced
@@ -28,8 +28,8 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 _EXTRA = "xla_backend_extra_options"
-# LLVM's later passes, kernels that go through MLIR first, and modules split into many parts take
-# time to compile and make none of these programs faster.
+# LLVM's later passes, kernels that go through MLIR first, and modules split into many parts
+# lengthen the compilation and do not make these programs faster.
 _OPTIONS: dict[str, int | bool] = {
     "xla_backend_optimization_level": 1,
     "xla_cpu_use_fusion_emitters": False,
@@ -46,7 +46,7 @@ def set_loop_threshold() -> None:
     XLA reads this option only from the environment.
 
     Nothing is changed if `JAXID_SET_XLA_FLAGS` is 0, if the user has set
-    `xla_backend_extra_options`, or if a backend runs, since XLA has read its flags by then.
+    `xla_backend_extra_options`, or if a backend runs, because XLA has then already read its flags.
     """
     if os.environ.get("JAXID_SET_XLA_FLAGS") == "0" or _user_sets(_EXTRA) or _backend_runs():
         return
@@ -66,7 +66,7 @@ def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result
     - `fun`: a pure function; arrays are traced, everything else is static.
     """
 
-    # Made at the first call: two dozen of them would noticeably slow down `import jaxid`.
+    # Made at the first call: two dozen such functions would noticeably slow down `import jaxid`.
     @functools.cache
     def jitted(outermost: bool) -> Callable[_Arguments, _Result]:
         options = _options() if outermost else {}
@@ -119,7 +119,7 @@ def _options() -> dict[str, int | bool]:
 
 
 def _is_ours(option: str, value: int | bool) -> bool:
-    """Whether an option is left to jaxid and known to this version of XLA."""
+    """Whether the user has not set an option, and this version of XLA knows it."""
     if _user_sets(option):
         return False
     try:
@@ -130,13 +130,13 @@ def _is_ours(option: str, value: int | bool) -> bool:
 
 
 def _user_sets(flag: str) -> bool:
-    """Whether `XLA_FLAGS` has the flag, or may have it, since it can name a file of flags."""
+    """Whether `XLA_FLAGS` has the flag, or names a file of flags, which may have it."""
     flags = os.environ.get("XLA_FLAGS", "").strip()
     return flag in flags or (flags != "" and not flags.startswith("-"))
 
 
 def keep_programs(folder: str | Path | None = None) -> None:
-    """Keeps compiled programs between processes: compiling is most of what a user waits for.
+    """Keeps compiled programs between processes, because compilation takes most of the time.
 
     The command `jaxid` does so by itself. If JAX already has a cache, it is left unchanged.
 

@@ -1,4 +1,4 @@
-"""What jaxid raises and warns with: every message is one sentence that says what to do."""
+"""Exceptions and warnings of jaxid; every message is one sentence that says what to do."""
 
 import dataclasses
 import difflib
@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args, get_origin
 
 
 class JaxidError(Exception):
-    """Anything jaxid raises on purpose."""
+    """Base class of the errors that jaxid raises."""
 
 
 class RecordingError(JaxidError, ValueError):
@@ -19,7 +19,7 @@ class RecordingError(JaxidError, ValueError):
 
 
 class ModelError(JaxidError, ValueError):
-    """A model is put together in a way that makes no sense."""
+    """A model is inconsistent, or unsuitable for the task."""
 
 
 class FitError(JaxidError, RuntimeError):
@@ -42,7 +42,7 @@ class NoiseError(FitError):
 
 
 class LimitsError(JaxidError, ValueError):
-    """Limits contradict each other, or leave no room for any motion."""
+    """Limits contradict each other, or allow no motion."""
 
 
 class MissingExtraError(JaxidError, ImportError):
@@ -50,7 +50,7 @@ class MissingExtraError(JaxidError, ImportError):
 
 
 class JaxidWarning(UserWarning):
-    """Something is probably, but not certainly, a mistake."""
+    """An input is probably, but not certainly, a mistake."""
 
 
 def sentence(source: str, what: str, remedy: str) -> str:
@@ -103,7 +103,7 @@ def require(module: str, extra: str) -> ModuleType:
 
 
 def check_words(settings: Any) -> None:
-    """Refuses a value that is not listed in the `Literal` of its field.
+    """Checks that string values are listed in the `Literal` of their fields.
 
     **Arguments:**
 
@@ -115,7 +115,7 @@ def check_words(settings: Any) -> None:
         words, value = _words(field.type), getattr(settings, field.name)
         if words and isinstance(value, str) and value not in words:
             raise FitError(
-                f"{field.name}={value!r} of {type(settings).__name__} is none of "
+                f"{field.name}={value!r} of {type(settings).__name__} is not one of "
                 f"{', '.join(map(repr, words))}{near(value, words)}"
             )
 

@@ -1,4 +1,4 @@
-"""A fitted arm as other programs read it: URDF for kinematics and bodies, MJCF for drives too."""
+"""Export of fitted arms: URDF has kinematics and bodies, MJCF also has drives."""
 
 import os
 from pathlib import Path
@@ -28,23 +28,23 @@ def write_urdf(
 
     Each joint's link gets the inertia of everything that moves with it; links fixed to it get none.
     `<dynamics>` gets viscous and Coulomb friction. A URDF cannot describe rotors; `write_mjcf`
-    writes them.
+    does.
 
     **Arguments:**
 
     - `loop`: of a `SerialArm`, fitted.
     - `source`: the URDF that the arm was read from, path or text. `path`: where to write.
-    - `bodies`: as `physical_bodies` gives them, `(joints, 10)`; the loop's own where None.
+    - `bodies`: as `physical_bodies` returns them, `(joints, 10)`; the loop's own if None.
     - `base`, `tip`: as given to `SerialArm.from_urdf`.
 
-    **Raises:** `ModelError` for a loop that is not of this URDF.
+    **Raises:** `ModelError` if the loop's arm is not that of the URDF.
     """
     arm = _serial(loop)
     found = read_urdf(source, base, tip)
     if len(found.joints) != arm.joints:
         raise ModelError(
-            f"this URDF has {len(found.joints)} joints and {loop.name} has {arm.joints}: give the "
-            "one that the arm was read from"
+            f"this URDF has {len(found.joints)} joints, but {loop.name} has {arm.joints}: give the "
+            "URDF that the arm was read from"
         )
     masses = np.asarray(arm.inertias() if bodies is None else bodies)
     root = parsed_urdf(source)
@@ -81,7 +81,7 @@ def write_mjcf(
     **Arguments:**
 
     - `loop`: of a `SerialArm`, fitted. `path`: where to write.
-    - `bodies`: as `physical_bodies` gives them, `(joints, 10)`; the loop's own where None.
+    - `bodies`: as `physical_bodies` returns them, `(joints, 10)`; the loop's own if None.
 
     **Raises:** `ModelError` for another arm, or bodies that MuJoCo would refuse.
     """
@@ -105,7 +105,7 @@ def write_mjcf(
         xx, xy, xz, yy, yz, zz = about[np.triu_indices(3)]
         if mass <= 0 or np.linalg.eigvalsh(about)[0] <= 0:
             raise ModelError(
-                f"link {k + 1} has mass {mass:.3g} kg and an inertia that no body has: give "
+                f"link {k + 1} has mass {mass:.3g} kg and an inertia that is not physical: give "
                 "bodies=jaxid.arms.physical_bodies(arm).bodies"
             )
         ElementTree.SubElement(

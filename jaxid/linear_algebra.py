@@ -36,7 +36,7 @@ def _(primals, tangents):
     (matrix,), (along,) = primals, tangents
     n = matrix.shape[-1]
     both = _exponential(jnp.block([[matrix, along], [jnp.zeros_like(matrix), matrix]]))
-    # The value is computed apart, since under `vmap` it may lack the batch axis of its slopes.
+    # The value is computed separately: under `vmap` it may lack the batch axis of its slopes.
     return _exponential(matrix), both[:n, n:]
 
 

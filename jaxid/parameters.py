@@ -1,4 +1,4 @@
-"""What a parameter is: a field declared once with symbol, unit, bounds and scale."""
+"""Physical parameters: fields that are declared once with symbol, unit, bounds and scale."""
 
 import dataclasses
 import math
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from .errors import ModelError
 
 if TYPE_CHECKING:
-    # Fields take numbers and hold arrays: a type checker does not see their converter.
+    # Fields accept numbers and hold arrays; a type checker does not see the converter.
     Scalar: TypeAlias = Any
     Vector: TypeAlias = Any
 else:
@@ -65,20 +65,20 @@ def parameter(
 
     **Arguments:**
 
-    - `default`: value if none is given; in the unit below.
+    - `default`: value if none is given, in `unit`.
     - `symbol`: its name in the literature, without the joint (`"Fv"`).
     - `unit`: SI unit as shown in tables.
-    - `lower`, `upper`: bounds that estimates keep to.
+    - `lower`, `upper`: bounds of estimates.
     - `scale`: typical size.
     - `free`: whether a fit estimates it by default.
-    - `linear`: whether torque is linear in it; regressions hold the other parameters fixed.
+    - `linear`: whether torque is linear in it; regressions hold nonlinear parameters fixed.
     """
     declaration = Declaration(symbol, unit, float(lower), float(upper), float(scale), free, linear)
     extra = {} if default is dataclasses.MISSING else {"default": default}
     return eqx.field(converter=as_float64, metadata={"parameter": declaration}, **extra)
 
 
-# Metadata of a field whose module is known, so that its parameters are not parameters of the model.
+# Metadata of a field whose module is known; its parameters are not parameters of the model.
 KNOWN = MappingProxyType({"known": True})
 
 
@@ -158,7 +158,7 @@ def list_parameters(model: Any) -> tuple[Parameter, ...]:
 
 @lru_cache(maxsize=1024)
 def _listed(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Parameter, ...]:
-    """The parameters of a module, cached by structure, since a fit needs them dozens of times."""
+    """The parameters of a module, cached by structure: a fit needs them dozens of times."""
     model = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(s, float) for s in shapes])
     found: list[Parameter] = []
     taken: set[str] = set()
@@ -238,7 +238,7 @@ def set_by_name(model: Any, **values: float) -> Any:
     for name, value in values.items():
         if np.size(value) != known[name].size:
             raise ModelError(
-                f"{name} holds {known[name].size} values, not {np.size(value)}: give that many"
+                f"{name} has {known[name].size} values, but {np.size(value)} are given: give all"
             )
     chosen = [known[name] for name in values]
     flat = jnp.concatenate([jnp.ravel(as_float64(v)) for v in values.values()])
@@ -265,7 +265,7 @@ def _whole(model: Any, known: dict[str, Parameter], values: dict[str, float]) ->
 class Bounds(eqx.Module):
     """Maps unbounded coordinates to parameter values inside their bounds.
 
-    Away from a bound the map is almost the identity, so that it hardly changes Gauss-Newton steps.
+    Away from a bound the map is almost the identity, so it hardly changes Gauss-Newton steps.
     """
 
     lower: Vector
@@ -312,7 +312,7 @@ class Bounds(eqx.Module):
     def moved_inside(self, values: Vector) -> Vector:
         """The values, `(parameters,)`, with those on or beyond a bound moved just inside.
 
-        Values inside stay, however close to a bound: all values of a small robot are close to zero.
+        Values inside are unchanged, even close to a bound: all values of a small robot are small.
         """
         traced = isinstance(values, jax.core.Tracer)
         xp = jnp if traced else np

@@ -1,4 +1,4 @@
-"""Ready robots: arm, friction, controller and start values of the papers."""
+"""Predefined robots: arm, friction, controller and start values from the papers."""
 
 import os
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ def _friction(joints: int, smoothing: float = 0.01) -> tuple[Viscous | Coulomb, 
 
 
 def scara(controller: AbstractController | None = None) -> ClosedLoop:
-    """The SCARA of Brunot et al. 2016 at its CAD start, under the PD law of their Table 1.
+    """The SCARA of Brunot et al. 2016 at its CAD values, under the PD law of their Table 1.
 
     **Arguments:**
 
@@ -56,7 +56,7 @@ def emps(controller: AbstractController | None = None) -> ClosedLoop:
     """
     friction = Viscous(joint=1, coefficient=100.0), Coulomb(joint=1, level=10.0, smoothing=5e-5)
     effects = (*friction, TorqueOffset(joint=1))
-    # At these speeds the smoothing of the sign affects the force. It is unknown, and so estimated.
+    # At these speeds the unknown smoothing of the sign affects the force, so it is estimated.
     law = controller or Cascade()
     return ClosedLoop(Axis(), law, effects, name="emps").free("eps1")
 
@@ -78,17 +78,18 @@ def serial(
 
     - `source`: path of the URDF, or its text.
     - `controller`: its law; `Tracking()` if None, for an unknown law.
-    - `rotors`: inertia of each drive at its joint, kg·m² or kg; estimated from zero where None.
+    - `rotors`: inertia of each drive at its joint, kg·m² or kg; if None, it is estimated, starting
+      at zero.
     - `gears`: turns of each motor per turn of each joint, `(joints, joints)`, if motors drive more
       than their own joint.
-    - `bodies`: `"drawn"` to leave the links' bodies as they are in the file, `"free"` to estimate
+    - `bodies`: `"drawn"` to hold the links' bodies at the values of the file, `"free"` to estimate
       their base parameters.
     - `base`, `tip`, `gravity`: as for `SerialArm.from_urdf`.
 
     **Raises:** `ModelError` for a file that describes no serial arm.
     """
     if bodies not in ("drawn", "free"):
-        raise ModelError(f"there is no choice {bodies!r} for bodies: give 'drawn' or 'free'")
+        raise ModelError(f"bodies is {bodies!r}: give 'drawn' or 'free'")
     found = read_urdf(source, base, tip)
     arm = SerialArm.of(found, gravity, gears)
     n = arm.joints
@@ -107,6 +108,6 @@ def serial(
         held = [f"Ia{j}" for j, inside in enumerate(arm.absorbed_rotors(), start=1) if inside]
     elif rotors is not None:
         held += [f"Ia{j}" for j in range(1, n + 1)]
-    # The smoothing of friction near standstill is unknown, and matters most for motions with rests.
+    # The smoothing of friction near standstill is unknown; it matters most for motions with rests.
     smoothings = [p.name for p in loop.parameters if p.declaration.symbol == "eps"]
     return loop.hold(*held).free(*smoothings)

@@ -279,7 +279,7 @@ def test_units_and_joints():
 
 
 def test_two_link_needs_one_of_coupling_and_length():
-    with pytest.raises(ModelError, match="give one, since p3 = link_length"):
+    with pytest.raises(ModelError, match="give one, because p3 = link_length"):
         TwoLink(p3=0.05, link_length=0.3)
     assert float(TwoLink(p5=0.2).coupling) == pytest.approx(0.05)
     assert float(TwoLink(p5=0.2, link_length=0.3).coupling) == pytest.approx(0.06)

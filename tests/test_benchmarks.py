@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
-# The benchmarks are no part of the package: they lie beside the tests in a checkout.
+# The benchmarks are not part of the package; a checkout has them beside the tests.
 sys.path.insert(0, str(ROOT))
 
 
@@ -46,7 +46,7 @@ def test_minimisers_and_gradients_agree_as_far_as_each_can(tmp_path):
         assert row["status"] == "converged"
         # What five more steps may gain where jaxid stops.
         assert row["loss_above"] < 1e-4, row
-    # A linearisation holds its own simulation; SciPy asks for either, or for one a parameter.
+    # A linearisation includes its simulation; SciPy calls either, or one per parameter.
     assert (ours["simulations"], ours["Jacobians"]) == (0, ours["steps"])
     assert exact["simulations"] == exact["steps"] >= exact["Jacobians"] > 0
     assert differences["Jacobians"] == 0

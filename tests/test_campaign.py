@@ -223,7 +223,7 @@ def test_a_worker_that_dies_takes_no_other_piece_down(tmp_path: Path) -> None:
     assert found["2"] == 4
     assert found["4"] == Failed("FitError: four")
     assert "ended from outside" in found["13"].reason
-    # It says nothing about the piece, which the next run tries again.
+    # The failure is not caused by the piece, so the next run tries it again.
     assert len(list((tmp_path / "c").glob("*.piece"))) == 2
 
 

@@ -28,11 +28,14 @@ def spoilt(recordings, change):
 MISTAKES = {
     "sign of joint 2": (
         lambda r: {"tau": r.tau * [1, -1]},
-        "torque of joint 2 looks as if its sign",
+        "torque of joint 2 seems to have the wrong sign",
     ),
-    "all signs": (lambda r: {"tau": -r.tau}, "torque of all joints looks as if its sign"),
+    "all signs": (lambda r: {"tau": -r.tau}, "torque of all joints seems to have the wrong sign"),
     "swapped": (lambda r: {"tau": r.tau[:, ::-1]}, "torques of joints 1 and 2"),
-    "degrees": (lambda r: {"q": np.rad2deg(r.q)}, "position of all joints looks .* degrees, not"),
+    "degrees": (
+        lambda r: {"q": np.rad2deg(r.q)},
+        "position of all joints seems to be in degrees, not",
+    ),
     "noise alone": (
         lambda r: {"q": r.q * [1, 0] + 1e-4 * np.random.default_rng(1).normal(size=r.q.shape)},
         "joint 2 moves by",

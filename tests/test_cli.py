@@ -132,10 +132,10 @@ def test_a_fit_that_failed_ends_with_one(monkeypatch, tmp_path):
     ("arguments", "says"),
     [
         (["fit", "absent.csv", *SCARA], "absent.csv"),
-        (["fit", FIT_1], "no robot is named"),
-        (["compare", FIT_1], "no robot is named"),
-        (["fit", FIT_1, *SCARA, "--log", "absent.toml"], "jaxid inspect --write makes one"),
-        (["fit", FIT_1, *SCARA, "--log", FIT_1], "no TOML"),
+        (["fit", FIT_1], "no robot is given"),
+        (["compare", FIT_1], "no robot is given"),
+        (["fit", FIT_1, *SCARA, "--log", "absent.toml"], "jaxid inspect --write creates one"),
+        (["fit", FIT_1, *SCARA, "--log", FIT_1], "is not valid TOML"),
         (["fit", FIT_1, *SCARA, "--unit", "q=deg,deg,deg"], "3 units for q of 2 joints"),
         (["fit", FIT_1, "--robot", "delta"], "there is no robot 'delta': choose scara"),
         (["fit", FIT_1, "--robot", "absent.py:loop"], "there is no file absent.py"),
@@ -145,7 +145,7 @@ def test_a_fit_that_failed_ends_with_one(monkeypatch, tmp_path):
         (["fit", FIT_1, *SCARA, "--column", "q"], "has no '='"),
         (["fit", FIT_1, *SCARA, "--unit", "q=parsec"], "is not a unit known for q"),
         (["fit", FIT_1, *SCARA, "--window", "0.01"], "make it longer"),
-        (["compare", FIT_1, *SCARA, "--fit", FIT_1], "holds no fitted parameters"),
+        (["compare", FIT_1, *SCARA, "--fit", FIT_1], "contains no fitted parameters"),
     ],
 )
 def test_a_users_error_is_one_sentence(arguments, says, tmp_path, monkeypatch):
@@ -166,7 +166,7 @@ def test_what_is_wrong_with_ones_own_robot_is_said(tmp_path):
             load_robot(f"{file}:{name}")
     broken = tmp_path / "broken.py"
     broken.write_text("import nothing_of_that_name\n")
-    with pytest.raises(ModelError, match="fails when it is imported"):
+    with pytest.raises(ModelError, match="cannot be imported"):
         load_robot(f"{broken}:loop")
     file.write_text(OWN_ROBOT + "\n\ndef asks(more):\n    return loop\n")
     with pytest.raises(ModelError, match=r"asks\(\) in .* give a function without arguments"):

@@ -60,7 +60,7 @@ def test_batch_simulator_agrees_with_the_continuous_one():
         def position(self, t):
             return [0.4, 0.4]
 
-    # M̂ = [[0.2, 0.1], [0.1, 0.1]] is no diagonal law, so its torque is prescribed by hand.
+    # M̂ = [[0.2, 0.1], [0.1, 0.1]] is not a diagonal law, so its torque is prescribed.
     class Law:
         period = None
 
@@ -145,7 +145,7 @@ def test_what_the_bound_cannot_be_for_is_said(bound):
         mass_error(ARM, ARM.workspace(), {"p9": (0.0, 1.0)})
     with pytest.raises(ModelError, match="not positive definite"):
         mass_error(ARM, ARM.workspace(), 0.6)
-    with pytest.raises(ModelError, match="no share"):
+    with pytest.raises(ModelError, match="give a share"):
         mass_error(ARM, ARM.workspace(), 20.0)
     with pytest.raises(ModelError, match="for 2 joints, but the gains are for 1"):
         certify(ComputedTorque(ARM, Kp=[9.0], Ki=[1.0], Kd=[6.0]), bound)

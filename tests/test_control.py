@@ -201,7 +201,7 @@ def test_open_loop_gives_the_recorded_torque():
 # --- tracking ---------------------------------------------------------------------------------
 
 
-# The low-pass knows nothing of what comes before and after, some five of its time constants.
+# The low-pass has no samples before the start and after the end: about five time constants.
 INSIDE = slice(10, -30)
 
 
@@ -354,7 +354,7 @@ def test_laws_of_other_joints_are_refused():
     for law in (PD(Kp=[9.0, 9.0, 9.0], Kv=1.0), jaxid.emps().controller):
         loop = dataclasses.replace(jaxid.scara(), controller=law)
         for work in (jaxid.simulate, jaxid.fit):
-            with pytest.raises(ModelError, match="of scara has no torque for 2 joints"):
+            with pytest.raises(ModelError, match="of scara gives no torque for 2 joints"):
                 work(loop, recording)
     for noise in ([], [np.zeros((300, 2))]):
         with pytest.raises(RecordingError, match="noise"):

@@ -148,7 +148,7 @@ def test_next_experiment_keeps_its_limits_and_separates(offset_story):
     assert proposed.then > 0
     torque = dataclasses.replace(diagnosis.fit.loop, controller=jaxid.control.OpenLoop())
     driven = dataclasses.replace(diagnosis, fit=dataclasses.replace(diagnosis.fit, loop=torque))
-    with pytest.raises(jaxid.errors.FitError, match="it follows no reference"):
+    with pytest.raises(jaxid.errors.FitError, match="cannot follow a reference"):
         jaxid.next_experiment(driven)
 
 
@@ -157,7 +157,9 @@ def test_an_experiment_for_a_transmission_is_refused(offset_story):
     story, _ = offset_story
     diagnosis = story.first_diagnosis
     shaft = next(v for v in diagnosis.ranking if v.key == ("joint_elasticity", 1))
-    with pytest.raises(jaxid.errors.FitError, match="joint_elasticity on joint 1 is a simulation"):
+    with pytest.raises(
+        jaxid.errors.FitError, match="joint_elasticity on joint 1 needs simulations"
+    ):
         jaxid.next_experiment(diagnosis, [diagnosis.ranking[0], shaft])
 
 

@@ -103,7 +103,7 @@ def test_two_fits_differ_by_their_scores(small_fit):
     expected = score_of(small_fit).value - score_of(other).value
     assert found.score.value == pytest.approx(expected)
     assert found.names == ("emps", "emps + quadratic_drag on joint 1")
-    assert "score, first less second" in repr(found)
+    assert "score, first minus second" in repr(found)
     assert max(map(len, repr(found).splitlines())) <= 80
     assert found.to_dict()["score"]["interval"] == list(found.score.interval)
     (bars,) = [t for t in found.plot().data if t.name]
@@ -112,7 +112,7 @@ def test_two_fits_differ_by_their_scores(small_fit):
 
 
 def test_what_cannot_be_compared_is_refused(case, loop, small_fit):
-    with pytest.raises(RecordingError, match="give the recordings to compare them on"):
+    with pytest.raises(RecordingError, match="give recordings for the comparison"):
         jaxid.compare_models(loop, loop)
     tracking = dataclasses.replace(loop, controller=jaxid.control.Tracking(cutoff=5.0))
     with pytest.raises(ModelError, match="same samples"):

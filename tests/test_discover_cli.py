@@ -240,8 +240,8 @@ def test_one_option_takes_several_files(given: str, meant: str) -> None:
     ("options", "says"),
     [
         (["absent.csv", *SCARA], "there is no such file"),
-        ([HIDDEN[0]], "no robot is named"),
-        ([HIDDEN[0], *SCARA, "--validate", HIDDEN[0]], "both to be fitted and held out"),
+        ([HIDDEN[0]], "no robot is given"),
+        ([HIDDEN[0], *SCARA, "--validate", HIDDEN[0]], "both fitted and held out"),
         ([HIDDEN[0], "--robot", "kuka"], "there is no robot 'kuka'"),
         ([HIDDEN[0], "--robot", "absent.py:loop"], "there is no file absent.py"),
         ([HIDDEN[0], *SCARA, "--catalogue", "absent.py:Hose"], "there is no file absent.py"),
@@ -297,11 +297,11 @@ def test_an_interrupt_keeps_the_steps_and_says_how_to_go_on(
     steps = tmp_path / "steps"
     said = _interrupted(monkeypatch, 2, "--resume", str(steps)).stderr
     assert "interrupted with 2 steps done" in said
-    assert f"--resume {steps} goes on from there" in said
+    assert f"to continue, repeat the command with --resume {steps}" in said
     # Without --resume the steps are kept too, beside what is there already.
     for name in ("jaxid-steps", "jaxid-steps-2"):
         said = _interrupted(monkeypatch, 1).stderr
-        assert f"--resume {name} goes on from there" in said
+        assert f"repeat the command with --resume {name}" in said
         assert [kept.read_text() for kept in (tmp_path / name).iterdir()] == ["kept"]
     assert "nothing is saved" in _interrupted(monkeypatch, 0).stderr
     left = sorted(p.name for p in tmp_path.iterdir())

@@ -106,11 +106,13 @@ def test_recordings_of_different_rates_share_no_noise_filter():
 
     both = [at(100), at(200)]
     for method in (jaxid.SeparablePEM(), jaxid.JointPEM()):
-        with pytest.raises(jaxid.errors.RecordingError, match="a noise filter holds for one rate"):
+        with pytest.raises(
+            jaxid.errors.RecordingError, match="a noise filter is valid for one rate"
+        ):
             jaxid.fit(jaxid.scara(), both, method)
-    with pytest.raises(jaxid.errors.RecordingError, match="200 samples a second"):
+    with pytest.raises(jaxid.errors.RecordingError, match="200 samples per second"):
         jaxid.discover(jaxid.scara(), both[0], both[1], progress=False)
-    with pytest.raises(jaxid.errors.RecordingError, match="200 samples a second"):
+    with pytest.raises(jaxid.errors.RecordingError, match="200 samples per second"):
         jaxid.diagnose(jaxid.compare(jaxid.scara(), both), progress=False)
 
 

@@ -1,4 +1,4 @@
-"""Numbers at the edge: a right answer or a named reason, never a number that is none."""
+"""Extreme numbers: a right answer or a named reason, never NaN."""
 
 import dataclasses
 import math
@@ -40,12 +40,12 @@ def pair(case: Any, **settings: Any) -> list[jaxid.Recording]:
 
 @pytest.fixture(scope="session")
 def plain(case: Any) -> jaxid.Fit:
-    """The fit that the others are held against."""
+    """The fit with which the others are compared."""
     return jaxid.fit(jaxid.scara(), pair(case), QUIET)
 
 
 def sound(fit: jaxid.Fit) -> None:
-    """Asserts that a success holds no number that is none."""
+    """Asserts that a successful fit contains no NaN."""
     assert np.isfinite(fit.theta).all()
     assert not np.isnan(fit.std).any()
     assert not np.isnan(fit.error_percent.to_numpy()).any()

@@ -189,11 +189,11 @@ def test_closed_loop_sensitivities_are_those_of_the_simulation():
 
 
 def test_result_shows_itself(found):
-    assert "left of the limits" in repr(found)
+    assert "margins to the limits" in repr(found)
     assert list(found.table().index) == list(found.names)
     assert found.reference(periods=2).duration == pytest.approx(8.0)
     assert len(found.plot().data) >= 2
-    assert "left of the limits" in found._repr_html_()
+    assert "margins to the limits" in found._repr_html_()
 
 
 # --- what cannot be done is said ------------------------------------------------------------------
@@ -204,7 +204,7 @@ def test_result_shows_itself(found):
     [
         ({"low": [2, -1], "high": [-2, 2]}, "limits.low of joint 1 is 2, not below limits.high"),
         ({"speed": [1, -1]}, "limits.speed of joint 2 is -1: it must be positive"),
-        ({"torque": [1.0]}, "limits.torque has 1 values where limits.low has 2"),
+        ({"torque": [1.0]}, "limits.torque has 1 values, but limits.low has 2"),
     ],
 )
 def test_limits_that_contradict_each_other_are_said(more, said):
@@ -214,12 +214,14 @@ def test_limits_that_contradict_each_other_are_said(more, said):
 
 def test_the_limit_that_leaves_no_pose_is_named():
     held_out = limits(low=[1.0, -0.5], high=[2.0, 0.5], torque=[2.0, 2.0])
-    with pytest.raises(LimitsError, match=r"limits.torque of joint 1 is 2, but to stand still"):
+    with pytest.raises(LimitsError, match=r"limits.torque of joint 1 is 2, but standing still"):
         jaxid.optimal_excitation(loop(), held_out)
     nowhere = jaxid.PlanarReach((0.3, 0.2), low=(0.6, -0.4), high=(0.8, 0.4))
-    with pytest.raises(LimitsError, match=r"limits.workspace leaves no pose"):
+    with pytest.raises(LimitsError, match=r"limits.workspace allows no pose"):
         jaxid.optimal_excitation(loop(), limits(workspace=nowhere))
-    with pytest.raises(LimitsError, match=r"limits.high of joint 2 leaves no room at the start"):
+    with pytest.raises(
+        LimitsError, match=r"limits.high of joint 2 allows no pose at the given start"
+    ):
         jaxid.optimal_excitation(loop(), limits(), start=[0.0, 3.0])
     with pytest.raises(LimitsError, match="workspace's x goes from 1 to 0"):
         jaxid.PlanarReach((0.3, 0.2), low=(1.0, 0.0), high=(0.0, 1.0))

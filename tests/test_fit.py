@@ -1,4 +1,4 @@
-"""Output error on a robot that jaxid did not simulate: truth, honesty, and how fits fail."""
+"""Output error on a robot that jaxid did not simulate: truth, deviations, and failing fits."""
 
 import dataclasses
 from typing import Literal
@@ -138,7 +138,7 @@ def test_position_as_output(cases, output):
     fit = jaxid.fit(jaxid.scara(), both(cases[0]), jaxid.OEM(output=output))
     truth = np.array([getattr(cases[0].plant, n) for n in fit.names])
     assert fit.status is jaxid.Status.converged
-    # Encoder steps are not noise at standstill, so deviations are not held against the truth here.
+    # Encoder steps are not noise at standstill, so deviations are not compared with the truth here.
     assert np.abs(fit.theta / truth - 1)[:2].max() < 0.02
 
 
@@ -230,9 +230,7 @@ def test_regressions_say_what_they_cannot_see(cases):
     one = both(cases[0])[0]
     for effect in (EncoderEccentricity(joint=1), JointElasticity(joint=1)):
         for method in (jaxid.IDIM(), jaxid.DIDIM(), jaxid.IDIMIV(), jaxid.IntegralLS()):
-            with pytest.raises(
-                FitError, match=f"which differ with {effect.effect_name()}: use OEM"
-            ):
+            with pytest.raises(FitError, match=f"which {effect.effect_name()} changes: use OEM"):
                 jaxid.fit(jaxid.scara().add(effect), one, method)
     held = jaxid.scara().hold(*jaxid.scara().names)
     for method in (jaxid.IDIM(), jaxid.IntegralLS(), jaxid.SeparablePEM()):
@@ -286,7 +284,7 @@ def test_a_gap_and_windows_that_forget_are_said(cases):
     assert not any("gap" in note for note in jaxid.fit(jaxid.scara(), one, jaxid.IDIM()).notes)
     windows = jaxid.OEM(window=5.0, max_steps=2)
     fit = jaxid.fit(jaxid.scara().add(Hysteresis(joint=2, level=0.01)), one, windows)
-    assert any("states of hysteresis at rest" in note for note in fit.notes)
+    assert any("states of hysteresis start at rest" in note for note in fit.notes)
     # Windows share their end samples, which count once.
     assert len(fit.residuals[0]) == one.samples
 
@@ -327,4 +325,4 @@ def test_derivatives_that_overflow_give_no_deviations():
     information = np.diag([1.0, np.inf])
     covariance, said = determined_covariance(information, ("a", "b"), np.ones(2))
     assert np.isinf(np.diag(covariance)).all()
-    assert "no deviation is known" in said[0]
+    assert "deviations are unknown" in said[0]

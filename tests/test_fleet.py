@@ -126,7 +126,7 @@ def test_a_fleets_worn_joint_stands_out(tmp_path):
     ("text", "says"),
     [
         ("name,robot\na,scara\n", "no column 'fit'"),
-        ("name,robot,fits\na,scara,x.csv\n", "a column 'fits'"),
+        ("name,robot,fits\na,scara,x.csv\n", "an unknown column 'fits'"),
         ("name,robot,fit\na,scara,x.csv\na,scara,y.csv\n", "'a' twice"),
     ],
 )

@@ -203,7 +203,7 @@ def at_substeps(case, substeps):
     loop = build() if substeps is None else set_substeps(build(), substeps)
     coarse = Problem(with_substeps(loop, Recordings.of(recording)), recording)
     jacobian = computed(coarse.sensitivities, problem.z)[1] / unit
-    # Together: a column that is next to nothing has no digits to lose.
+    # Together: an almost zero column has no digits to lose.
     return np.linalg.norm(jacobian - exact) / np.linalg.norm(exact)
 
 

@@ -184,7 +184,11 @@ def test_a_log_is_inspected_described_and_read(tmp_path):
 
 def test_a_description_that_says_something_else_is_refused(tmp_path):
     toml = tmp_path / "log.toml"
-    for text, says in (("colums = {}", "'colums'"), ("gaps = 3", "'gaps'"), ("= 1", "no TOML")):
+    for text, says in (
+        ("colums = {}", "'colums'"),
+        ("gaps = 3", "'gaps'"),
+        ("= 1", "is not valid TOML"),
+    ):
         toml.write_text(text)
         refused = run("fit", FIT_1, "--robot", "scara", "--log", toml)
         assert refused.exit_code == 2

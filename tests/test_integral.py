@@ -218,7 +218,7 @@ def test_integral_beats_filtered_and_difference_at_coarse_encoders(smooth):
             fit = jaxid.fit(loop(), recording(smooth, q=q, resolution=step), method)
             errors[name].append(share(fit))
     size = {name: np.sqrt(np.mean(np.square(e))) for name, e in errors.items()}
-    # Filtered and difference have both lost the arm at 13 bits; which is worse says nothing.
+    # At 13 bits filtered and difference both fail; it does not matter which is worse.
     assert size["integral"] < 0.5 * min(size["filtered"], size["difference"])
 
 
@@ -277,7 +277,7 @@ def test_poles_are_checked(smooth):
 
 
 def test_what_fourier_cannot_do_is_said(smooth):
-    with pytest.raises(FitError, match=r"500 harmonics cannot be told from 1000 samples"):
+    with pytest.raises(FitError, match=r"500 harmonics cannot be determined from 1000 samples"):
         jaxid.fit(loop(), recording(smooth), jaxid.FourierLS(harmonics=500))
     rng = np.random.default_rng(8)
     t = np.arange(0.0, 10.0, 0.01)

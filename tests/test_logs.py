@@ -335,7 +335,7 @@ def of_ros_1(folder):
 
 
 MALFORMED = {
-    "an HDF5 file that unpacks to much": (unpacked_to_much, "holds at least 8000000000 bytes"),
+    "an HDF5 file that unpacks to much": (unpacked_to_much, "has at least 8000000000 bytes"),
     "a bag of ROS 1": (of_ros_1, "is a bag of ROS 1; convert it with rosbags-convert"),
     "no such topic": (
         malformed_bag(moving("a"), columns={"tau": "/joint_states/efort/a"}),
@@ -386,7 +386,7 @@ MALFORMED = {
         ),
         "no topic has messages about joints, there are /clock (builtin_interfaces/msg/Time)",
     ),
-    "a bag that is cut off": (cut_bag, "damaged, cut off or of another kind"),
+    "a bag that is cut off": (cut_bag, "damaged, truncated or of another kind"),
     "types that are not defined": (undefined, "and does not define them"),
     "frames that are absent": (no_data, "there is no Parquet file in data"),
     "info without features": (no_features, "meta/info.json does not describe features"),
@@ -397,7 +397,7 @@ MALFORMED = {
     ),
     "names that are too many": (
         lambda folder: jaxid.read(dataset(folder / "arm", names="abc")),
-        "meta/info.json names 3 parts of observation.state, which has 2",
+        "meta/info.json names 3 parts of observation.state, but it has 2",
     ),
     "an HDF5 file that is cut off": (cut_hdf5, "cannot be read as .h5, it is damaged"),
     "an image as a signal": (
@@ -410,7 +410,7 @@ MALFORMED = {
         lambda folder: jaxid.read(hdf5(folder / "run.h5"), joints=["a"]),
         "its columns are not named by joint",
     ),
-    "no table": (lambda folder: jaxid.Recording.from_table([1, 2]), "[1, 2] is no table"),
+    "no table": (lambda folder: jaxid.Recording.from_table([1, 2]), "[1, 2] is not a table"),
     "lists of uneven lengths": (
         lambda folder: jaxid.Recording.from_table(
             pd.DataFrame(

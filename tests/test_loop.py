@@ -46,7 +46,7 @@ def test_add_and_without():
 
 def test_without_what_is_not_there_says_what_is():
     loop = jaxid.scara()
-    with pytest.raises(ModelError, match="no effect 'spring' to take away: .* coulomb, viscous"):
+    with pytest.raises(ModelError, match="no effect 'spring' to remove: .* coulomb, viscous"):
         loop.without("spring")
     with pytest.raises(ModelError, match="no effect 'coulomb' on joint 3"):
         loop.without("coulomb", joint=3)

@@ -215,7 +215,7 @@ def test_every_solver_of_optimistix_finds_the_same_minimum(solver, off, recordin
 
 
 def test_what_is_no_solver_is_refused(recordings):
-    with pytest.raises(FitError, match="is no solver: give one of optimistix"):
+    with pytest.raises(FitError, match="is not a solver: give an optimistix solver"):
         jaxid.fit(jaxid.scara(), recordings, jaxid.OEM(solver="BFGS"))
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("recordings",))
     method = jaxid.OEM(solver=optx.BFGS(1e-6, 1e-6), mesh=mesh)

@@ -184,7 +184,7 @@ def test_one_output_alone_is_burg():
     ("series", "order", "says"),
     [
         ([np.ones(100)], 2, "constant"),
-        ([np.random.default_rng(0).standard_normal(40)], 60, "shorter than the noise filter"),
+        ([np.random.default_rng(0).standard_normal(40)], 60, "too few for the noise filter"),
         ([np.random.default_rng(0).standard_normal(40)], 20, "lower the order"),
         ([np.array([1.0, np.nan, 2.0] * 20)], 2, "not finite"),
         ([np.random.default_rng(0).standard_normal(40)], -1, "0 or more"),

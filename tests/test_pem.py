@@ -148,7 +148,7 @@ def test_the_papers_formula_has_one_ratio_for_all_parameters(fits, recording):
     assert printed["paper"]["ZZ1r"] < 0.6 * printed["sandwich"]["ZZ1r"]
     assert np.allclose(printed["sandwich"], own["sandwich"])
     shown = jaxid.with_deviations(fits["sep"], "paper")
-    assert "not to be trusted" in repr(shown)
+    assert "not reliable" in repr(shown)
     assert np.allclose(shown.std, jaxid.deviations(fits["sep"])["paper"])
 
 
@@ -199,9 +199,9 @@ def test_a_vector_filter_takes_noise_that_joints_share(fits, recording):
 @pytest.mark.parametrize(
     ("method", "says"),
     [
-        (jaxid.SeparablePEM(GIVEN, orders=(2, 1500)), "shorter than the noise filter"),
+        (jaxid.SeparablePEM(GIVEN, orders=(2, 1500)), "too few for the noise filter"),
         (jaxid.SeparablePEM(GIVEN, orders=(2, 400)), "lower the order"),
-        (jaxid.JointPEM(GIVEN, orders=(2, 1500)), "shorter than the noise filter"),
+        (jaxid.JointPEM(GIVEN, orders=(2, 1500)), "too few for the noise filter"),
         (jaxid.SeparablePEM(GIVEN, orders=(2,)), "one for each"),
         (jaxid.JointPEM(GIVEN, orders=(2, 2, 2)), "one for each"),
     ],
@@ -222,7 +222,7 @@ def test_a_limit_of_time_holds_for_joint_prediction_error_too(recording):
 
 
 def test_filters_are_given_for_every_output(recording):
-    with pytest.raises(NoiseError, match="filters for 1 outputs are given, there are 2"):
+    with pytest.raises(NoiseError, match="filters are given for 1 outputs, but there are 2"):
         jaxid.fit(jaxid.scara(), recording, jaxid.SeparablePEM(GIVEN, filters=FILTERS[:1]))
 
 

@@ -122,7 +122,7 @@ def test_recordings_select_and_rename() -> None:
         recordings["fit2"]
     with pytest.raises(RecordingError, match="no recording"):
         Recordings.of([])
-    with pytest.raises(RecordingError, match="1 joints where fit has 2"):
+    with pytest.raises(RecordingError, match="1 joints, but fit has 2"):
         Recordings.of([fit, Recording.from_arrays(**signals(1))])
 
 
@@ -194,7 +194,7 @@ def test_columns_may_be_products_numbers_and_whole_arrays(tmp_path: Path) -> Non
 def test_names_without_an_underscore(name: str) -> None:
     table = frame().rename(columns={f"{name}_{j}": f"{name}{j}" for j in (1, 2)})
     same(Recording.from_dataframe(table), Recording.from_arrays(**signals()))
-    with pytest.raises(RecordingError, match=f"'{name}1' is missing though '{name}2' is there"):
+    with pytest.raises(RecordingError, match=f"'{name}1' is missing, but '{name}2' is there"):
         Recording.from_dataframe(table.drop(columns=f"{name}1"))
 
 

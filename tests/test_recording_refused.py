@@ -54,21 +54,21 @@ LINES = csv().decode().splitlines(keepends=True)
 COMPLAINTS = {
     "empty": ("a.csv", b"", "the file is empty"),
     "blank": ("a.csv", b"\n \n", "there are no rows"),
-    "header only": ("a.csv", LINES[0].encode(), "a header and no rows"),
+    "header only": ("a.csv", LINES[0].encode(), "a header but no rows"),
     "binary": ("a.csv", bytes(range(256)), "is not UTF-8 text"),
     "nul": ("a.csv", b"time,q_1\0", "is not UTF-8 text"),
     "extension": ("a.xlsx", b"PK", r"extension '.xlsx' is not known; use .csv"),
     "no extension": ("a", b"PK", "extension '' is not known"),
     "gz of mat": ("a.mat.gz", b"PK", "extension '.gz' is not known"),
-    "missing": ("a.csv", without("tau_2"), r"'tau_2' is missing though 'q_2' is there, there are"),
-    "no time": ("a.csv", without("time"), r"'time' is missing.*say which.*columns=\{'time'"),
+    "missing": ("a.csv", without("tau_2"), r"'tau_2' is missing, but 'q_2' is there, there are"),
+    "no time": ("a.csv", without("time"), r"'time' is missing.*name its column.*columns=\{'time'"),
     "no q": ("a.csv", without("q_1", "q_2"), "'q_1' is missing"),
-    "q_2 alone": ("a.csv", without("q_1"), "'q_1' is missing though 'q_2' is there"),
+    "q_2 alone": ("a.csv", without("q_1"), "'q_1' is missing, but 'q_2' is there"),
     "misnamed": ("a.csv", renamed(q_2="q2"), r"'q_2' is missing.*did you mean 'q2'"),
     "misnamed time": ("a.csv", renamed(time="Time"), r"did you mean 'Time'"),
     "doubled": ("a.csv", renamed(v_1="q_1"), "'q_1' appears more than once"),
     "both": ("a.csv", renamed(v_1="q"), "both q and q_1"),
-    "fewer v": ("a.csv", without("v_2"), "q has 2 joints and v has 1"),
+    "fewer v": ("a.csv", without("v_2"), "q has 2 joints, but v has 1"),
     "no header": ("a.csv", "".join(LINES[1:]).encode(), "no header.*time,q_1,tau_1"),
     "text cell": ("a.csv", at("q_2", 17, "high"), "q_2, line 18 holds 'high'.*not a number"),
     "decimal comma": (
@@ -80,13 +80,13 @@ COMPLAINTS = {
     "empty cell": ("a.csv", at("tau_1", 3, None), "tau_1, line 4 is empty or not finite"),
     "infinite": ("a.csv", at("v_1", 60, "inf"), r"v_1, line 61 is empty or not finite \(inf\)"),
     "overflow": ("a.csv", at("v_1", 60, "1e999"), "v_1, line 61 is empty or not finite"),
-    "short row": ("a.csv", csv() + b"0.6,1", "line 62 has 2 cells where the header has 11"),
+    "short row": ("a.csv", csv() + b"0.6,1", "line 62 has 2 cells, but the header has 11"),
     "long row": ("a.csv", csv() + LINES[1].strip().encode() + b",1", "line 62 has 12 cells"),
     "open quote": ("a.csv", csv(n=0.5).replace(b"0.5\n", b'"\n', 1), "EOF inside string"),
     "long quote": (
         "a.csv",
         csv(n=0.5).replace(b"0.5\n", b'"\n', 1).replace(b",0.5\n", b',a"\n', 1),
-        "a quoted cell runs over several rows",
+        "a quoted cell spans several rows",
     ),
     "repeated time": ("a.csv", later(9, -0.01), r"time repeats at line 10.*sort the rows"),
     "decreasing time": ("a.csv", later(9, -0.05), r"time goes back at line 10"),
@@ -95,7 +95,7 @@ COMPLAINTS = {
     "constant q": ("a.csv", csv(q_2=0.5), r"q of joint 2 \(q_2\) is constant at 0.5"),
     "constant tau": ("a.csv", csv(tau_1=0), r"tau of joint 1 \(tau_1\) is constant at 0;"),
     "no gzip": ("a.csv.gz", csv(), "cannot be read as .csv.gz, it is damaged"),
-    "cut gzip": ("a.csv.gz", gzip.compress(csv())[:-20], "damaged, cut off"),
+    "cut gzip": ("a.csv.gz", gzip.compress(csv())[:-20], "damaged, truncated"),
     "no zip": ("a.npz", b"hello", "cannot be read as .npz"),
     "npy": ("a.npz", b"\x93NUMPY\x01\x00", "cannot be read as .npz"),
     "pickled": (
@@ -105,7 +105,7 @@ COMPLAINTS = {
     ),
     "complex": ("a.npz", npz(q=signals()["q"] + 1j), "q holds complex values; give its real part"),
     "dates": ("a.npz", npz(time=np.arange(SAMPLES).astype("M8[s]")), "time holds dates"),
-    "transposed": ("a.npz", npz(q=signals()["q"].T), "q .* has 2 rows where time has 60.*transpos"),
+    "transposed": ("a.npz", npz(q=signals()["q"].T), "q .* has 2 rows, but time has 60.*transpos"),
     "too deep": ("a.npz", npz(q=np.ones((SAMPLES, 2, 2))), "q .* has shape .60, 2, 2"),
     "scalar time": ("a.npz", npz(time=0.0), "time has shape"),
     "no mat": ("a.mat", b"hello" * 99, "cannot be read as .mat"),
@@ -149,7 +149,7 @@ def test_a_struct_that_holds_everything_is_named(tmp_path: Path) -> None:
 def test_a_bare_array_in_npz_is_refused(tmp_path: Path) -> None:
     with (tmp_path / "fit.npz").open("wb") as file:
         np.save(file, np.ones(40))
-    with pytest.raises(RecordingError, match="one bare array"):
+    with pytest.raises(RecordingError, match="one unnamed array"):
         read(tmp_path / "fit.npz")
 
 
@@ -162,7 +162,7 @@ def test_a_bare_array_in_npz_is_refused(tmp_path: Path) -> None:
         ({"units": {"q": ["deg"] * 3}}, "units gives 3 units for q of 2 joints"),
         ({"columns": {"Tau": ["a"]}}, r"columns names 'Tau' \(did you mean 'tau'\?\)"),
         ({"columns": {"q": ["q_1", "pos2"]}}, "'pos2' is missing"),
-        ({"columns": {"q": ["q_1"]}}, "q has 1 joints and q_ref has 2"),
+        ({"columns": {"q": ["q_1"]}}, "q has 1 joints, but q_ref has 2"),
         ({"columns": {"tau": []}}, "no column for tau"),
         ({"columns": {"tau": ["q_1*", "q_2"]}}, r"column '' is missing.*--column tau="),
         ({"columns": {"tau": ["2*i_1", "q_2"]}}, r"column 'i_1' is missing.*--column tau="),
@@ -181,8 +181,8 @@ def test_complaints_about_settings(arguments: dict, pattern: str) -> None:
     [
         ({"q": [[1.0, 2.0], [3.0]]}, "q is ragged"),
         ({"q": None}, "q, row 1 holds None"),
-        ({"tau": signals()["tau"][:-1]}, "tau .* has 59 rows where time has 60"),
-        ({"v": signals(3)["v"]}, "q has 2 joints and v has 3"),
+        ({"tau": signals()["tau"][:-1]}, "tau .* has 59 rows, but time has 60"),
+        ({"v": signals(3)["v"]}, "q has 2 joints, but v has 3"),
         ({"q": signals()["q"].astype(str)}, "q holds text"),
         ({"q_ref": signals()["q"].astype(object)}, "q_ref holds text or Python objects"),
         ({"tau_ff": np.full((SAMPLES, 2), 1e308)}, "tau_ff_1, row 1 is empty or not finite"),

@@ -109,7 +109,7 @@ def test_another_friction_curve_is_no_further_effect():
     assert story.verdict == "explained"
     assert [(a["effect"], a["joint"]) for a in story.to_dict()["added"]] == [("spring", 1)]
     assert any("eps1 was estimated" in note for note in story.notes)
-    with pytest.raises(jaxid.errors.RecordingError, match="what judges a model"):
+    with pytest.raises(jaxid.errors.RecordingError, match="a model must be tested"):
         jaxid.discover(axis(), runs, validate=runs[0], progress=False)
 
 

@@ -95,7 +95,7 @@ def test_the_verdict_comes_first(page: Page) -> None:
     assert told().story.sentence in text
     order = ["Measured and simulated", "Effect that was found"]
     order += ["All recordings, joints and steps", "Models that were compared", "Parameters"]
-    order += ["Where it still fails", "To do it again"]
+    order += ["Where the model still fails", "How to reproduce this result"]
     # After the links to them.
     places = [text.index(told().story.sentence), *(text.rindex(heading) for heading in order)]
     assert places == sorted(places)

@@ -94,7 +94,7 @@ def test_what_is_late_or_limited_matters():
 
 @pytest.mark.parametrize("law", [Tracking(), Sampled(PD(Kp=1.0, Kv=1.0), every=0.01)])
 def test_a_law_that_no_drive_computes_is_refused(law):
-    with pytest.raises(ModelError, match="Sampled holds a continuous law"):
+    with pytest.raises(ModelError, match="cannot be the law of Sampled"):
         Sampled(law, every=0.002)
 
 

@@ -165,7 +165,7 @@ def test_a_class_of_the_users_may_have_moved(small_fit: jaxid.Fit) -> None:
 
 
 def test_code_is_not_saved(tmp_path: Path, small_fit: jaxid.Fit) -> None:
-    with pytest.raises(SaveError, match=r"result\.method is .* cannot hold"):
+    with pytest.raises(SaveError, match=r"result\.method is .* cannot be stored"):
         dataclasses.replace(small_fit, method=lambda: 1).save(tmp_path / "fit.jaxid")
     with pytest.raises(SaveError, match="only numbers can be saved"):
         archive.pack({"a": np.array([object()])})

@@ -154,7 +154,7 @@ def test_a_header_that_lies(shape: tuple[int, ...]) -> None:
     np.lib.format.write_array_header_1_0(
         buffer, {"descr": "<f8", "fortran_order": False, "shape": shape}
     )
-    with pytest.raises(ValueError, match="promises"):
+    with pytest.raises(ValueError, match="declares"):
         arrays.npy(buffer.getvalue() + bytes(16))
 
 
@@ -240,7 +240,7 @@ def test_flipped_bytes(tmp_path: Path, whole: bytes, small_fit: jaxid.Fit, data:
     except SaveError:
         refused(tmp_path / "fit", bytes(content))
     else:
-        # A flip in what nobody reads, such as a member's date.
+        # A flip in bytes that are not read, such as a member's date.
         same(small_fit, back)
 
 

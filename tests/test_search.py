@@ -169,7 +169,7 @@ def test_a_search_that_may_add_nothing_says_that_something_is_left(offset_case):
     found = jaxid.discover(jaxid.scara(), fit, held_out, most=0, progress=False)
     assert found.unfinished
     assert len(found.steps) == 1
-    assert "lacks something" in found.sentence
+    assert "lacks an effect, but none was to be added" in found.sentence
 
 
 def test_effects_share_the_sharpness_that_is_estimated_for_their_joint():
@@ -185,7 +185,7 @@ def test_effects_share_the_sharpness_that_is_estimated_for_their_joint():
 
 @pytest.mark.slow
 def test_a_load_that_drives_the_axis_into_its_limit_is_found():
-    """Its signature promises an eighth of it, and filters that know no more bar the way.
+    """Its signature predicts an eighth of it, and filters of that prediction prevent convergence.
 
     The drive is at the controller's limit in both recordings, in the loaded one for longer.
     """

@@ -1,4 +1,4 @@
-"""Noise told apart from physics: p-values where recordings are not alike."""
+"""Separation of noise and physics: p-values for recordings that differ."""
 
 import dataclasses
 

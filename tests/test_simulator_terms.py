@@ -113,14 +113,14 @@ def test_what_has_no_term_is_named_with_its_reason():
     peak = Stribeck(joint=1, level=jnp.asarray(0.02))
     loop = pendulum(PID(Kp=[1.0], Ki=[1.0], Kd=[0.1]), peak, soft, motor=False)
     why = unsaid(loop)
-    assert why[-1] == "an integral is no kp and kd"
+    assert why[-1] == "an integral cannot be expressed by kp and kd"
     assert len(why) == 3
     assert "fall with speed" in why[2]
-    assert "gives way" in why[3]
+    assert "one rigid joint" in why[3]
     (terms,) = joint_terms(pendulum(Tracking(), motor=False))
     assert (terms.kp, terms.kd) == (None, None)
     limited = pendulum(Servo(gain=[GAIN], supply=[SUPPLY], deadband=0.01)).with_values(imax1=1.0)
-    assert unsaid(limited)[-1].startswith("a deadband is no kp and kd; forcerange limits")
+    assert unsaid(limited)[-1].startswith("a deadband cannot be expressed by kp and kd; forcerange")
     (terms,) = joint_terms(limited)
     assert terms.forcerange == pytest.approx(MOTOR["kt"] * 1.0)
 

@@ -185,7 +185,7 @@ def test_a_bristle_at_speed_asks_for_smaller_steps(lengths):
     stiff = jaxid.scara().add(jaxid.effects.Hysteresis(joint=2, level=0.1, slide=6e-4))
     speed = max(np.abs(np.diff(r.q[:, 1]) / np.diff(r.time)).max() for r in recordings)
     substeps = with_substeps(stiff, recordings).stepping.substeps
-    # Runge and Kutta's fourth order runs away at 2.8 over the rate, which is speed over slide.
+    # RK4 becomes unstable at 2.8 over the rate, which is speed over slide.
     assert 0.01 * speed / 6e-4 / substeps < 2.8
     # What was settled for a loop without it counts no longer; what a user has set does.
     before = with_substeps(jaxid.scara(), recordings)

@@ -9,7 +9,7 @@ import pytest
 
 import jaxid
 
-# The benchmarks are no part of the package: they lie beside the tests in a checkout.
+# The benchmarks are not part of the package; a checkout has them beside the tests.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import stepwise

@@ -1,4 +1,4 @@
-"""An effect moved by hand: the linear system's answer against simulations and refits."""
+"""An effect set by sliders: the linear system's answer, compared with simulations and refits."""
 
 import dataclasses
 
@@ -108,7 +108,7 @@ def test_an_explorer_follows_its_sliders(start, held_out):
     assert lines["with the effect"] == pytest.approx(record.tau[:, 1] - rest, abs=1e-5)
     with pytest.raises(ModelError, match="there is no slider Fs2: there are offset2"):
         explorer.move(Fs2=1.0)
-    with pytest.raises(ModelError, match="drive_gain on joint 1 is not offered"):
+    with pytest.raises(ModelError, match="drive_gain on joint 1 is not in the list"):
         explorer.choose("drive_gain", 1)
     explorer.refit()
     assert explorer.fit.names[-1] == "offset2"

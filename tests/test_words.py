@@ -32,9 +32,50 @@ PHRASES = {
     r"what there is (so far|to)": "the result so far",
     r"\bis worth asking\b|worth asking about": "to screen",
     r"wrong valley|finds? back\b": "wrong minimum, converges",
+    r"\bruns? away\b": "diverges",
+    r"\bgives? way\b": "is compliant",
+    r"\bmakes? up for\b": "absorbs",
+    r"\btold apart\b|\btells? (it|them) apart\b": "distinguished",
+    r"\bcannot (be told|tell it) from\b": "cannot distinguish",
+    r"\bholds? no\b": "contains no",
+    r"\b(goes|going|go) on from\b": "continues",
+    r"\bno fit (has seen|saw)\b": "held out",
+    r"\bmend (it|that|them)\b": "correct",
+    r"\b[Mm]easured less\b|\bfirst less second\b": "minus",
+    r"\b(counts|filter|samples|series|steps|task|turns) an? (core|output|second|turn)\b": "per",
+    r"\bgoes round\b": "is fed back",
+    r"\bjudged on\b": "tested on",
+    r"\blooks? as if\b": "seems",
+    r"\b[Nn]one where\b|\*\*Raises:\*\* `\w+` where\b": "if",
+    r"\bshared? out\b": "distributed",
+    r"\bnext to none\b": "almost none",
+    r"\bhonest\b|\bhonesty\b": "correct",
+    r"\bis no (kp|TOML|table|solver|share|sampl)": "is not a",
+    r"\bat hand\b": "present",
+    r"\bpart company\b|\bcomes? apart\b": "differ, can be distinguished",
+    r"\bworth asking\b|\bto be asked\b": "to screen",
+    r"\bsays? nothing\b|\bsay something\b": "has no information",
+    r"\bwhat (there )?is there\b": "the existing",
 }
-# Their docstrings and messages have not been rewritten yet.
-LATER = {"cli", "discovery", "display", "excitation", "report", "simulation"}
+# Modules that have not been rewritten yet.
+LATER = {
+    f"discovery/{name}"
+    for name in (
+        "_discover",
+        "explore",
+        "finite",
+        "likelihood",
+        "predict",
+        "ranking",
+        "release",
+        "screening",
+        "search",
+        "support",
+        "system",
+        "verdict",
+        "verify",
+    )
+}
 
 
 def pages() -> dict[str, str]:
@@ -56,11 +97,17 @@ def spoken(source: str) -> str:
 
 
 def modules() -> dict[str, str]:
-    """What the modules say that have been rewritten."""
+    """Comments and strings of the modules that have been rewritten."""
     package = ROOT / "jaxid"
     paths = [p.relative_to(package) for p in sorted(package.rglob("*.py"))]
-    kept = [p for p in paths if len(p.parts) > 1 and p.parts[0] not in LATER]
+    kept = [p for p in paths if p.with_suffix("").as_posix() not in LATER]
     return {str(p): spoken((package / p).read_text("utf-8")) for p in kept}
+
+
+def benchmarks() -> dict[str, str]:
+    """Docstrings and comments of the benchmarks, in a checkout that has them."""
+    paths = sorted((ROOT / "benchmarks").glob("*.py"))
+    return {p.name: spoken(p.read_text("utf-8")) for p in paths}
 
 
 def found_in(texts: dict[str, str]) -> list[str]:
@@ -74,10 +121,10 @@ def found_in(texts: dict[str, str]) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("texts", [pages, modules])
+@pytest.mark.parametrize("texts", [pages, modules, benchmarks])
 def test_no_phrase_that_must_be_read_twice(texts) -> None:
     given = texts()
-    assert len(given) > 15
+    assert len(given) > 15 or texts is benchmarks
     assert not found_in(given)
 
 

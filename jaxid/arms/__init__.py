@@ -1,4 +1,4 @@
-"""Rigid bodies: equations of motion in base parameters, one arm a file."""
+"""Rigid bodies: equations of motion in base parameters, one arm per file."""
 
 from ..chain import BODY as BODY
 from ..chain import Chain as Chain

@@ -16,8 +16,8 @@ from ..parameters import list_parameters, read_values, write_values
 class Split(eqx.Module):
     """A regressor without accelerations: d²/dt² `second` + d/dt `first` + `zeroth`.
 
-    Each is `(joints, parameters)`. `second` holds positions alone, the others positions and
-    velocities (Li, Peng, Juang 2023).
+    Each is `(joints, parameters)`. `second` depends on positions only, the others depend on
+    positions and velocities (Li, Peng, Juang 2023).
     """
 
     second: Float[Array, "joints parameters"]
@@ -34,7 +34,7 @@ class AbstractArm(eqx.Module):
     @property
     @abc.abstractmethod
     def joints(self) -> int:
-        """How many joints it has."""
+        """Number of joints."""
 
     @abc.abstractmethod
     def mass_matrix(self, q: Float[Array, " joints"]) -> Float[Array, "joints joints"]:
@@ -102,14 +102,14 @@ class AbstractArm(eqx.Module):
         return True
 
     def in_space(self) -> InSpace | None:
-        """Its joints and bodies in space, None where not known.
+        """Its joints and bodies in space, None if not known.
 
-        With them a base that is not level and payloads are looked for in space.
+        They allow effects in space: a base that is not level, and payloads.
         """
         return None
 
     def couplings(self) -> tuple[tuple[int, int, float], ...]:
-        """Pairs of joints that may share a shaft, and its turns for one turn of the first joint."""
+        """Pairs of joints that may share a shaft, and its turns per turn of the first joint."""
         return ()
 
     def link_lengths(self) -> tuple[float, ...]:
@@ -117,7 +117,7 @@ class AbstractArm(eqx.Module):
         return ()
 
     def first_moments(self) -> tuple[tuple[float, float] | None, ...]:
-        """First moments (MX, MY) of each link in its own frame, kg·m; None where not known."""
+        """First moments (MX, MY) of each link in its own frame, kg·m; None if not known."""
         return (None,) * self.joints
 
     def gravity(self) -> float:
@@ -144,7 +144,7 @@ class AbstractArm(eqx.Module):
         return drawn * (np.arange(self.joints) > 0)
 
     def smallest_inertia(self) -> Float[Array, ""]:
-        """Smallest eigenvalue of the mass matrix over the workspace; above zero when physical."""
+        """Smallest eigenvalue of the mass matrix over the workspace; above zero if physical."""
 
         def at(q: Float[Array, " joints"]) -> Float[Array, ""]:
             return smallest_eigenvalue(self.mass_matrix(q))

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from ..errors import ModelError, require
 from .serial import SerialArm
 
-# Smallest allowed eigenvalue of a body's scaled pseudo-inertia, so that points and thin rods of a
-# drawing count as consistent.
+# Smallest allowed eigenvalue of a body's scaled pseudo-inertia; points and thin rods of a drawing
+# count as consistent.
 _LEAST = 1e-7
 # Distance, in deviations, below which the estimate itself counts as physically consistent.
 _THERE = 1e-2
@@ -20,7 +20,7 @@ class PhysicalBodies(eqx.Module):
     - `bodies`: `BODY` of each link, SI units. Among all bodies with these base parameters they are
       the nearest to the drawing.
     - `base`: their base parameters.
-    - `distance`: from these to the estimated ones, in standard deviations; zero where the estimate
+    - `distance`: distance from these to the estimate, in standard deviations; zero if the estimate
       is physically consistent.
     """
 
@@ -39,18 +39,19 @@ def physical_bodies(
 ) -> PhysicalBodies:
     """The physically consistent bodies nearest to an arm's base parameters.
 
-    Solves a semidefinite program, for which the extra `sdp` must be installed.
+    Solves a semidefinite program, which needs the extra `sdp`.
 
-    A body is physical where its pseudo-inertia is positive definite (Wensing, Kim, Slotine 2018;
-    Sousa, Cortesão 2014). Estimated base parameters need not belong to physical bodies: they may
-    have absorbed an effect that the model lacks, such as a spring that balances the arm.
+    A body is physical if its pseudo-inertia is positive definite (Wensing, Kim, Slotine 2018;
+    Sousa, Cortesão 2014). Estimated base parameters may not belong to physical bodies, for example
+    if they have absorbed an effect that the model lacks, such as a spring that balances the arm.
 
     **Arguments:**
 
     - `arm`: with estimated base parameters.
-    - `covariance`: of these; None takes the size of each parameter as its standard deviation.
+    - `covariance`: covariance of these parameters; if None, the standard deviation of each
+      parameter is its magnitude.
 
-    **Raises:** `ModelError` where the program has no solution; `MissingExtraError`.
+    **Raises:** `ModelError` if the program has no solution; `MissingExtraError`.
     """
     cvxpy = require("cvxpy", "sdp")
     require("clarabel", "sdp")
@@ -80,8 +81,8 @@ def physical_bodies(
     moved = unknown - (drawn / scale).ravel()
     _solved(cvxpy, cvxpy.sum_squares(moved) + 1e8 * cvxpy.sum_squares(same), matter)
     found = np.asarray(bodies.value)
-    # What the program's tolerance leaves of the base parameters, unless only it keeps a body that
-    # is drawn as a point from being none.
+    # Removes the error in the base parameters that is due to the program's tolerance, unless a body
+    # that is drawn as a point would then not be physical.
     own = scale.ravel()
     rest = np.linalg.lstsq(combined * own, reached - combined @ found)[0] * own
     if smallest_eigenvalues((found + rest).reshape(drawn.shape)).min() > 0:
@@ -90,7 +91,7 @@ def physical_bodies(
 
 
 def smallest_eigenvalues(bodies: Float[np.ndarray, "joints 10"]) -> Float[np.ndarray, " joints"]:
-    """Of each body's pseudo-inertia; above zero where the body is physical."""
+    """Smallest eigenvalue of each body's pseudo-inertia; above zero if the body is physical."""
     return np.array([np.linalg.eigvalsh(_pseudo_inertia(np, body))[0] for body in bodies])
 
 
@@ -107,7 +108,7 @@ def _pseudo_inertia(library, body):
 
 
 def _scales(arm: SerialArm) -> Float[np.ndarray, "joints 10"]:
-    """Scales of each link's parameters: those of a ball of its mass, as large as the links."""
+    """Scales of each link's parameters: those of a ball of its mass and the size of the links."""
     drawn = np.asarray(arm.bodies)
     mass = np.maximum(drawn[:, 9], 0.05 * drawn[:, 9].max())
     moment = np.linalg.norm(drawn[:, 6:9], axis=1)
@@ -126,5 +127,5 @@ def _solved(cvxpy, objective, constraints) -> None:
         ) from error
     if problem.status not in ("optimal", "optimal_inaccurate"):
         raise ModelError(
-            f"no physical bodies were found ({problem.status}): fit recordings that move more"
+            f"no physical bodies were found ({problem.status}): fit recordings with more motion"
         )

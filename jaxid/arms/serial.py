@@ -29,11 +29,11 @@ class SerialArm(AbstractArm):
 
     - `chain`: its joints. `bodies`: `BODY` of each link as drawn, SI units, `(joints, 10)`.
     - `lower`, `upper`: limits of the joints, `(joints,)`, rad or m.
-    - `gears`: turns of each motor for those of each joint, `(joints, joints)`, where motors drive
-      more than their own joint; None where each has its own.
-    - `base`: values of the base parameters, `(base,)`, in kg·m², kg·m or kg as their names say;
-      those of `bodies` by default.
-    - `leading`, `base_names`, `combined`: results of `base_parameters`, which is called where they
+    - `gears`: turns of each motor per turn of each joint, `(joints, joints)`, if motors drive more
+      than their own joint; None if each motor drives one joint.
+    - `base`: values of the base parameters, `(base,)`, in kg·m², kg·m or kg according to their
+      names; those of `bodies` by default.
+    - `leading`, `base_names`, `combined`: results of `base_parameters`, which is called if they
       are left out.
     """
 
@@ -69,9 +69,9 @@ class SerialArm(AbstractArm):
         **Arguments:**
 
         - `source`: path of the file, or its text.
-        - `base`, `tip`: names of the first and last link; where None, the root, and the only leaf.
+        - `base`, `tip`: names of the first and last link; if None, the root and the only leaf.
         - `gravity`: in the frame of the first link, m/s².
-        - `gears`: as above.
+        - `gears`: as in the class.
 
         **Raises:** `ModelError` for a file that cannot be read or describes no such chain.
         """
@@ -88,7 +88,7 @@ class SerialArm(AbstractArm):
         if gears is not None and np.shape(gears) != (len(found.joints),) * 2:
             raise ModelError(
                 f"gears have shape {np.shape(gears)}, but the arm has {len(found.joints)} joints: "
-                "give a square matrix, a row for each motor and a column for each joint"
+                "give a square matrix with a row per motor and a column per joint"
             )
         rotations, offsets, axes = (
             np.stack([getattr(joint, what) for joint in found.joints])
@@ -117,8 +117,8 @@ class SerialArm(AbstractArm):
     def inertias(self) -> Float[Array, "joints 10"]:
         """`BODY` of each link with these base parameters, SI units.
 
-        They give the right torque; the combinations that torque does not depend on are as in
-        `bodies`.
+        They give the torque of these base parameters; combinations on which torque does not depend
+        are as in `bodies`.
         """
         drawn = jnp.ravel(self.bodies)
         changed = self.base - self.combined @ drawn
@@ -175,10 +175,10 @@ class SerialArm(AbstractArm):
         return False
 
     def in_space(self) -> InSpace:
-        """Its chain, and the bodies on it."""
+        """Its chain and bodies."""
         shift = jax.jacfwd(moved_body)(jnp.zeros(10), self.chain.tip)
         shown = np.asarray(self.combined)[:, -10:] @ np.asarray(shift)
-        # Mass and first moments, which weigh as well, before moments of inertia.
+        # Mass and first moments, which also cause gravity torque, before moments of inertia.
         kept = _independent(shown, [9, 6, 7, 8, *range(6)], 1e-6)
         return InSpace(self.chain, self.inertias(), tuple(kept))
 
@@ -205,9 +205,9 @@ class SerialArm(AbstractArm):
         return np.random.default_rng(0).uniform(low, high, (8 * self.joints, self.joints))
 
     def smallest_inertia(self) -> Float[Array, ""]:
-        """Smallest eigenvalue of the mass matrix over the workspace; above zero when physical.
+        """Smallest eigenvalue of the mass matrix over the workspace; above zero if physical.
 
-        Bodies drawn as points make it singular up to rounding. Rotor inertias are not included.
+        With bodies drawn as points it is zero up to rounding. Rotor inertias are not included.
         """
         masses = jax.vmap(self.mass_matrix)(jnp.asarray(self.workspace()))
         found = jnp.linalg.eigvalsh(masses)
@@ -217,14 +217,14 @@ class SerialArm(AbstractArm):
 def base_parameters(
     chain: Chain, lower: tuple[float, ...], upper: tuple[float, ...]
 ) -> tuple[tuple[int, ...], tuple[str, ...], Float[np.ndarray, "base parameters"]]:
-    """Which combinations of the bodies' parameters torque depends on (Gautier 1991).
+    """The combinations of the bodies' parameters on which torque depends (Gautier 1991).
 
     **Arguments:**
 
     - `lower`, `upper`: limits of the joints, rad or m.
 
-    **Returns:** the place of the parameter that leads each combination, its name (with an R where
-    others are added to it), and the combinations, `(base, 10 · joints)`.
+    **Returns:** for each combination, the place of its leading parameter and its name (with an R if
+    other parameters are added), and the combinations, `(base, 10 · joints)`.
     """
     return _base_parameters(_geometry(chain), chain.slides, lower, upper)
 
@@ -233,7 +233,7 @@ Geometry = tuple[tuple[float, ...], ...]
 
 
 def _geometry(chain: Chain) -> Geometry:
-    """A chain's numbers as what a cache can look up."""
+    """A chain's numbers in hashable form, for a cache."""
     arrays = chain.rotations, chain.offsets, chain.axes, chain.gravity
     return tuple(tuple(np.asarray(x).ravel().tolist()) for x in arrays)
 
@@ -269,7 +269,7 @@ def _base_parameters(
 def _independent(
     rows: Float[np.ndarray, "rows columns"], order: Sequence[int], tolerance: float
 ) -> list[int]:
-    """Columns that are no sum of those before them in that order."""
+    """Columns that do not depend linearly on earlier ones, in the given order."""
     size = np.linalg.norm(rows, axis=0)
     kept: list[int] = []
     basis = np.zeros((len(rows), 0))
@@ -287,10 +287,10 @@ def _independent(
 
 
 def _led(place: int, chain: Chain) -> tuple[bool, int]:
-    """Where a parameter stands among those that may lead a combination.
+    """The rank of a parameter among those that may lead a combination.
 
     Mass, the first moment along the axis and one moment across it are combined with parameters of
-    the previous link (Khalil, Dombre 2002). They lead only where there is no such parameter.
+    the previous link (Khalil, Dombre 2002). They lead a combination only without such parameters.
     """
     axis = int(np.argmax(np.abs(np.asarray(chain.axes)[place // 10])))
     across = (axis + 2) % 3
@@ -305,7 +305,7 @@ def _regressor(
     lower: tuple[float, ...],
     upper: tuple[float, ...],
 ) -> tuple[Float[np.ndarray, "rows parameters"], Float[np.ndarray, "states joints"]]:
-    """Regressor of all bodies' parameters at random states, a row for each joint; accelerations."""
+    """Regressor of all bodies' parameters at random states, a row per joint; accelerations."""
     chain, n = _chain(geometry, slides), len(slides)
     rng = np.random.default_rng(0)
     q = rng.uniform(lower, upper, (20 * n, n))

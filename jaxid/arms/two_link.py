@@ -13,8 +13,8 @@ class TwoLink(AbstractArm):
     """Two links in a vertical plane (Li, Peng, Juang 2023).
 
     `q[0]` is the first link's angle from hanging down, `q[1]` the second's relative to the first,
-    in rad. `p3` is the product of the first link's length and the second's first moment: give
-    `link_length` (m) to have p3 = link_length · p5 and one parameter less.
+    in rad. `p3` is the product of the first link's length and the second's first moment. With
+    `link_length` (m), p3 = link_length · p5 is not a parameter.
     """
 
     p1: Scalar = parameter(0.1, symbol="p1", unit="kg·m²", lower=0.0, scale=0.1)
@@ -27,11 +27,11 @@ class TwoLink(AbstractArm):
 
     def __post_init__(self):
         if self.p3 is None and self.link_length is None:
-            # Links of a quarter metre: a start value only.
+            # Corresponds to links of a quarter metre; only a start value.
             self.p3 = 0.25 * self.p5
         elif self.p3 is not None and self.link_length is not None:
             raise ModelError(
-                "TwoLink has both p3 and link_length: give one, since p3 = link_length · p5"
+                "TwoLink has both p3 and link_length: give one, because p3 = link_length · p5"
             )
 
     @property

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ..errors import ModelError
 
-# Larger than any robot's, and small enough to be parsed at once.
+# Larger than the file of any robot, and small enough to be parsed at once.
 _LARGEST = 20_000_000
 
 
@@ -31,13 +31,13 @@ class DescribedJoint(eqx.Module):
 
 
 class Described(eqx.Module):
-    """A chain as a URDF describes it.
+    """A chain as described by a URDF.
 
-    - `name`: of the robot. `joints`: those that move, from the base on.
+    - `name`: name of the robot. `joints`: the moving joints, beginning at the base.
     - `bodies`: ten parameters of each joint's link and all that is fixed to it, `(joints, 10)`, in
       the link's frame and the order of `jaxid.arms.BODY`.
-    - `carried`: names of the links whose bodies these are.
-    - `tip`: where the last link of the chain has its origin, in the frame of the last joint, m.
+    - `carried`: names of the links that these bodies include.
+    - `tip`: origin of the chain's last link, in the frame of the last joint, m.
     """
 
     name: str = eqx.field(static=True)
@@ -50,7 +50,7 @@ class Described(eqx.Module):
 def parsed_urdf(source: str | os.PathLike[str]) -> Any:
     """The document of a URDF, path or text, as an `ElementTree` element.
 
-    **Raises:** `ModelError` for a file that cannot be read or is no URDF.
+    **Raises:** `ModelError` for a file that cannot be read or is not a URDF.
     """
     return _parsed(source)[0]
 
@@ -66,7 +66,7 @@ def read_urdf(
     **Arguments:**
 
     - `source`: path of the file, or its text.
-    - `base`, `tip`: names of the first and last link; where None, the root, and the only leaf.
+    - `base`, `tip`: names of the first and last link; if None, the root and the only leaf.
 
     **Raises:** `ModelError` for a file that cannot be read or describes no such chain.
     """
@@ -79,7 +79,7 @@ def read_urdf(
         child, parent = (_end(joint, what, links, where) for what in ("child", "parent"))
         if child in parents:
             raise ModelError(
-                f"{where} hangs link {child!r} on two joints: a serial arm's links have one each"
+                f"{where} has two joints with child {child!r}: each link of a serial arm has one"
             )
         parents[child] = (parent, joint)
     _check_circles(parents, where)
@@ -89,7 +89,7 @@ def read_urdf(
     owner, joints = _chain(path, where)
     if not joints:
         raise ModelError(
-            f"{where} has no joint that moves between {base!r} and {tip!r}: name other links"
+            f"{where} has no moving joint between {base!r} and {tip!r}: name other links"
         )
     bodies, carried = _bodies(links, parents, owner, base, len(joints), where)
     _check_masses(bodies, joints, where)
@@ -102,7 +102,7 @@ def read_urdf(
 
 
 def _parsed(source: str | os.PathLike[str]) -> tuple[Any, str]:
-    """The root of the document, and how to call it."""
+    """The root of the document, and its name in messages."""
     text, where = str(source), "this URDF"
     if not text.lstrip().startswith("<"):
         where = str(source)
@@ -114,14 +114,14 @@ def _parsed(source: str | os.PathLike[str]) -> tuple[Any, str]:
         except (OSError, UnicodeDecodeError, ValueError) as error:
             raise ModelError(f"{where} cannot be read ({error}): give a URDF file") from error
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ModelError(f"{where} declares entities, which a URDF has no use for: take them out")
+        raise ModelError(f"{where} declares entities, which a URDF does not need: remove them")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         raise ModelError(f"{where} is not XML ({error}): correct that line") from error
     if root.tag != "robot":
         hint = " (run xacro on it first)" if "xacro" in text else ""
-        raise ModelError(f"{where} has <{root.tag}> at its top, where a URDF has <robot>{hint}")
+        raise ModelError(f"{where} has the root <{root.tag}>, but a URDF has <robot>{hint}")
     return root, where
 
 
@@ -138,8 +138,8 @@ def _end(joint: Any, what: str, links: dict[str, Any], where: str) -> str:
     name = None if found is None else found.get("link")
     if name not in links:
         raise ModelError(
-            f"joint {_name(joint, where)!r} in {where} has {name!r} as its {what}, which is no "
-            "link there: name one that is"
+            f"joint {_name(joint, where)!r} in {where} has {name!r} as its {what}, but there is no "
+            "such link: correct the name"
         )
     return name
 
@@ -150,7 +150,7 @@ def _check_circles(parents: dict, where: str) -> None:
         while at in parents:
             if at in seen:
                 raise ModelError(
-                    f"{where} has joints in a circle through link {at!r}: a serial arm has a base"
+                    f"{where} has a closed chain through link {at!r}: a serial arm is open"
                 )
             seen.add(at)
             at = parents[at][0]
@@ -163,16 +163,16 @@ def _base(base: str | None, links: dict, parents: dict, where: str) -> str:
             raise ModelError(f"{where} has several roots, {', '.join(roots)}: give base=")
         return roots[0]
     if base not in links:
-        raise ModelError(f"{where} has no link {base!r} for a base: it has {', '.join(links)}")
+        raise ModelError(f"{where} has no link {base!r} (base): it has {', '.join(links)}")
     return base
 
 
 def _tip(tip: str | None, base: str, links: dict, parents: dict, where: str) -> str:
     if tip is not None:
         if tip not in links:
-            raise ModelError(f"{where} has no link {tip!r} for a tip: it has {', '.join(links)}")
+            raise ModelError(f"{where} has no link {tip!r} (tip): it has {', '.join(links)}")
         return tip
-    # A leaf has no moving joint after it: flanges and tool frames are fixed.
+    # A leaf has no moving joint after it; flanges and tool frames are fixed.
     ends: dict[str, str] = {}
     carrying = {parent for parent, _ in parents.values()}
     for leaf in (name for name in links if name not in carrying):
@@ -212,7 +212,7 @@ def _path(base: str, tip: str, parents: dict, where: str) -> list[tuple[str, Any
 def _chain(
     path: Sequence[tuple[str, Any]], where: str
 ) -> tuple[dict[str, tuple[int, np.ndarray, np.ndarray]], list[DescribedJoint]]:
-    """Joints that move; and of each link on the path the number of its joint and where it is."""
+    """The moving joints; for each link on the path, the number of its joint and its frame."""
     owner, joints = {}, []
     turn, place = np.eye(3), np.zeros(3)
     for link, joint in path:
@@ -221,8 +221,8 @@ def _chain(
         place, turn = place + turn @ own_place, turn @ own_turn
         if joint.find("mimic") is not None:
             raise ModelError(
-                f"joint {name!r} in {where} mimics another: a serial arm's joints move on their "
-                "own, so end the chain before it with tip="
+                f"joint {name!r} in {where} mimics another: the joints of a serial arm must be "
+                "independent, so end the chain before it by tip="
             )
         if kind in ("revolute", "continuous", "prismatic"):
             joints.append(_moving(joint, name, link, kind, (turn, place), where))
@@ -244,20 +244,20 @@ def _moving(
     axis = _numbers("1 0 0" if element is None else element.get("xyz"), 3, f"the axis of {said}")
     length = np.linalg.norm(axis)
     if not length > 0:
-        raise ModelError(f"{said} has an axis of no length: give its direction")
+        raise ModelError(f"{said} has an axis of zero length: give its direction")
     limit = joint.find("limit")
     low, high = (-math.pi, math.pi) if kind != "prismatic" else (-1.0, 1.0)
     if kind != "continuous" and limit is not None:
         low = float(_numbers(limit.get("lower", "0"), 1, f"the lower limit of {said}")[0])
         high = float(_numbers(limit.get("upper", "0"), 1, f"the upper limit of {said}")[0])
         if not low < high:
-            raise ModelError(f"{said} has limits {low:g} and {high:g}: the lower comes first")
+            raise ModelError(f"{said} has limits {low:g} and {high:g}: lower must be below upper")
     turn, place = frame
     return DescribedJoint(name, link, turn, place, axis / length, kind == "prismatic", low, high)
 
 
 def _origin(element: Any, said: str) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and place of an element's origin in the frame that it is in."""
+    """Rotation and position of an element's origin in its parent frame."""
     origin = None if element is None else element.find("origin")
     if origin is None:
         return np.eye(3), np.zeros(3)
@@ -274,7 +274,7 @@ def _numbers(text: str | None, count: int, said: str) -> np.ndarray:
     except ValueError:
         values = np.array([math.nan])
     if len(values) != count or not np.isfinite(values).all():
-        raise ModelError(f"{said} reads {text!r}: give {count} finite numbers")
+        raise ModelError(f"{said} is {text!r}: give {count} finite numbers")
     return values
 
 
@@ -289,7 +289,7 @@ def _bodies(
     count: int,
     where: str,
 ) -> tuple[Float[np.ndarray, "joints 10"], tuple[str, ...]]:
-    """Bodies of the chain's links with all that is fixed to them, and the links' names."""
+    """Bodies of the chain's links, including all links fixed to them, and the names of these."""
     found, carried = np.zeros((count, 10)), []
     for link, element in links.items():
         frame, at = (np.eye(3), np.zeros(3)), link
@@ -321,12 +321,12 @@ def _body(
     values = [float(_numbers(tensor.get(k, "0"), 1, f"{k} of {said}")[0]) for k in names]
     xx, xy, xz, yy, yz, zz = values
     about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    # Files round, so a thin plate may violate the inequality in its last digit.
+    # Numbers in files are rounded, so a thin plate may violate the inequality in its last digit.
     least = np.linalg.eigvalsh(0.5 * np.trace(about) * np.eye(3) - about).min()
     if mass < 0 or least < -1e-2 * max(np.trace(about), 1e-9):
         raise ModelError(
-            f"{said} has mass {mass:g} and an inertia that no body has: masses and principal "
-            "moments are positive, and no moment is more than the sum of the others"
+            f"{said} has mass {mass:g} and an inertia that is not physical: masses and principal "
+            "moments must be positive, and no moment may exceed the sum of the others"
         )
     turn, centre = _origin(inertial, said)
     turn, centre = frame[0] @ turn, frame[1] + frame[0] @ centre

@@ -23,10 +23,10 @@ Examples:
 
 \b
 Exit codes:
-  0    it is done, whatever the verdict but one
-  1    a fit that did not converge; its result is printed and written all the same
-  2    something given cannot be used; the one line on stderr says what to do
-  3    a discovery whose verdict is undetermined; its result is printed and written all the same
+  0    success
+  1    a fit did not converge, or a robot of discover-all failed; the results are still written
+  2    an input cannot be used; one line on stderr explains what to do
+  3    the verdict of a discovery is undetermined; its result is still printed and written
   130  interrupted by Ctrl-C
 
 Colours and progress are shown on a terminal only; NO_COLOR turns colours off.
@@ -56,7 +56,7 @@ def common(
     """Options of the command itself."""
 
 
-# In the order in which the help lists them.
+# The help lists the commands in this order.
 app.command()(inspect)
 app.command()(fit)
 app.command()(compare)

@@ -8,8 +8,8 @@ from typing import Any
 
 from ..recording import Contents
 
-# Common names of the signals, without numbers and folders; the first that occurs is taken. A
-# column may continue after the name, as pos_measured.
+# Common names of the signals, without numbers and folders; the first one that occurs is used. A
+# column name may have a suffix, such as pos_measured.
 _CALLED = {
     "time": ("time", "t", "stamp", "timestamp", "time_s", "sec", "ms", "dt", "period"),
     "q": ("q", "pos", "position", "angle", "theta", "joint_pos", "qpos", "actual_q"),
@@ -52,7 +52,7 @@ def _parts(name: str) -> tuple[str, int]:
 def _word(signal: str, words: Sequence[str], stems: Mapping[str, Any]) -> str | None:
     """A stem that is one of the words, or one that begins with a word of three letters or more."""
     exact = next((word for word in words if word in stems), None)
-    # A name is not taken for time only because it begins with a word for time.
+    # A prefix alone does not identify the time; the stem must match the pattern below.
     longer = () if signal == "time" else (f"{word}_" for word in words if len(word) > 2)
     begun = (stem for word in longer for stem in stems if stem.startswith(word))
     if signal == "time" and exact is None:
@@ -82,13 +82,13 @@ def on_torque(names: Sequence[str]) -> str:
     stems = {_parts(name)[0] for name in names if "*" not in name}
     if stems & {*_CURRENTS}:
         return (
-            "tau is a current by its name: give torque constant times gear ratio of each joint as "
-            "scale (--write, then [scale])"
+            "tau seems to be a current (by its name): give torque constant times gear ratio of "
+            "each joint as scale (--write, then [scale])"
         )
     if stems & {*_VOLTAGES}:
         return (
-            "tau is a duty cycle or a voltage by its name, from which the motor's law makes a "
-            "torque: it is proportional to it only where the motor hardly turns"
+            "tau seems to be a duty cycle or a voltage (by its name): torque follows from it by "
+            "the motor's law, and is proportional to it only at low speed"
         )
     return ""
 
@@ -108,9 +108,9 @@ def description(told: Mapping[str, Any], found: Contents, joints: int) -> str:
     named = bool(found.joints) and "columns" not in told
     lines = [
         "# How jaxid reads these logs: jaxid discover FILES --log THIS.toml",
-        f"gaps = {json.dumps(told.get('gaps', 'refuse'))}  # allow or refuse: missing stretches",
-        f"clock = {json.dumps(told.get('clock', 'recorded'))}  # or even: where times jitter",
-        f"nan = {json.dumps(told.get('nan', 'refuse'))}  # or drop: empty samples",
+        f"gaps = {json.dumps(told.get('gaps', 'refuse'))}  # refuse or allow missing stretches",
+        f"clock = {json.dumps(told.get('clock', 'recorded'))}  # or even, if the times jitter",
+        f"nan = {json.dumps(told.get('nan', 'refuse'))}  # or drop empty samples",
     ]
     if "resolution" in told:
         lines.append(f"resolution = {json.dumps(told['resolution'])}  # encoder step, rad or m")
@@ -119,7 +119,7 @@ def description(told: Mapping[str, Any], found: Contents, joints: int) -> str:
         mark = "" if named else "# "
         lines.append(f"{mark}joints = {json.dumps(order)}  # in the order of the robot")
     if named:
-        lines += ["", "# Columns follow joints; these are for others than those found:"]
+        lines += ["", "# Columns follow from joints; to use other columns, edit these lines:"]
         lines += ["# [columns]", *(f"# {line}" for line in columns)]
     else:
         lines += ["", "[columns]", *columns]
@@ -128,7 +128,7 @@ def description(told: Mapping[str, Any], found: Contents, joints: int) -> str:
         "[units]  # rad, deg, turn, m, mm; Nm, mNm, N; s, ms, us",
         *(f"{name} = {json.dumps(value)}" for name, value in units.items()),
         "",
-        "[scale]  # of current: torque constant times gear ratio; of counts: rad or m in each",
+        "[scale]  # current: torque constant times gear ratio; counts: rad or m per count",
         *(f"{name} = {json.dumps(value)}" for name, value in scale.items()),
     ]
     return "\n".join(lines) + "\n"

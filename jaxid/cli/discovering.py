@@ -78,13 +78,13 @@ def discover(
     files: Files,
     validate: Annotated[
         list[Path] | None,
-        typer.Option(help="Recordings held out of the fit, to judge by: one or several."),
+        typer.Option(help="Held-out recordings that test the model: one or several."),
     ] = None,
     robot: Robot = None,
     json_file: Json = None,
     report: Report = None,
     resume: Annotated[
-        Path | None, typer.Option(help="Save each step in this folder, and go on from there.")
+        Path | None, typer.Option(help="Save each step in this folder, and continue from it.")
     ] = None,
     save: Annotated[
         Path | None,
@@ -93,10 +93,10 @@ def discover(
     catalogue: Catalogue = None,
     exclude: Annotated[
         list[str] | None,
-        typer.Option(help="An effect of the catalogue that is not asked for, as stribeck."),
+        typer.Option(help="An effect of the catalogue to leave out, such as stribeck."),
     ] = None,
     worth: Annotated[
-        float, typer.Option(help="What is worth knowing: share of a joint's torque, %.")
+        float, typer.Option(help="Leave out effects below this share of each joint's torque, %.")
     ] = 0.05,
     column: Column = None,
     unit: Unit = None,
@@ -109,9 +109,9 @@ def discover(
 ) -> None:
     """Find the physical effect that the model lacks, and add it.
 
-    The exit code is 0 for a verdict, 3 where it is undetermined, 2 where something given cannot be
-    used. Ctrl-C keeps the steps so far in the folder of --resume, or else in jaxid-steps, and says
-    how to go on.
+    The exit code is 0 for a verdict, 3 if the verdict is undetermined, 2 if an input cannot be
+    used. Ctrl-C keeps the steps so far in the folder of --resume, or in jaxid-steps without it;
+    a message explains how to continue.
 
     \b
     Examples:
@@ -125,7 +125,7 @@ def discover(
     from ..report import write_report
 
     journal = _Kept(resume)
-    # The folder must exist until the farewell of an interrupt has moved the steps out of it.
+    # After an interrupt `farewell` moves the steps out of the folder, which must exist until then.
     with journal, sentences(journal.farewell):
         check_outputs(json_file, report, save)
         loop = with_controller(load_robot(robot), controller)
@@ -166,7 +166,7 @@ class _Kept:
 
     def __exit__(self, *_: object) -> None:
         if self.own is not None:
-            # After an interrupt, the farewell has already moved the steps out of this folder.
+            # After an interrupt, `farewell` has already moved the steps out of this folder.
             shutil.rmtree(self.own, ignore_errors=True)
 
     def farewell(self) -> str:
@@ -179,7 +179,7 @@ class _Kept:
             path = next(p for p in _names("jaxid-steps") if not p.exists())
             shutil.move(self.path, path)
         said = f" with {done} step{'s' if done > 1 else ''} done"
-        return f"{said}; the same command with --resume {path} goes on from there"
+        return f"{said}; to continue, repeat the command with --resume {path}"
 
 
 def _names(name: str) -> Iterator[Path]:
@@ -194,8 +194,8 @@ def _check_apart(files: list[Path], held_out: list[Path]) -> None:
     both = {path.resolve() for path in files} & {path.resolve() for path in held_out}
     if both:
         raise RecordingError(
-            f"{min(both).name} is both to be fitted and held out: what judges a model must not "
-            "have made it"
+            f"{min(both).name} is both fitted and held out: a model must be tested on recordings "
+            "to which it was not fitted"
         )
 
 
@@ -203,9 +203,9 @@ def demo(
     report: Report = None,
     quiet: Quiet = False,
 ) -> None:
-    """The story on bundled recordings: a model that suffices, and one that lacks an effect.
+    """Run discover on bundled recordings: with a complete model, and with one that lacks an effect.
 
-    Takes about a minute, most of it to compile. With --report, the second story as a page.
+    Takes about a minute, mostly for compilation. --report writes the second result as a page.
 
     \b
     Example:

@@ -1,4 +1,4 @@
-"""Ends of commands: one sentence after a user's mistake, an immediate exit on Ctrl-C."""
+"""How commands end: with one sentence after a user error, immediately after Ctrl-C."""
 
 import contextlib
 import os
@@ -22,7 +22,7 @@ UNDETERMINED = 3
 
 @contextlib.contextmanager
 def sentences(on_interrupt: Callable[[], str] = str) -> Iterator[None]:
-    """Ends with one sentence on a user's error and a message on Ctrl-C, without a traceback.
+    """Ends a command with one sentence after a user error or Ctrl-C, without a traceback.
 
     **Arguments:**
 
@@ -61,7 +61,7 @@ def _part() -> None:
 
 
 def leave_on_interrupt() -> None:
-    """Ends the process a second after Ctrl-C if the main thread has not, as while compiling.
+    """Ends the process a second after Ctrl-C if the main thread does not, such as in a compilation.
 
     Python's own handler waits for the compiler to return, which takes up to a minute. Files are
     written under another name first, so that no incomplete file remains.

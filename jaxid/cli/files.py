@@ -41,7 +41,7 @@ class ReadOptions(eqx.Module):
     def __call__(self, files: Sequence[Path]) -> Any:
         """The recordings in files.
 
-        **Raises:** `RecordingError` or `ModelError` for what cannot be read.
+        **Raises:** `RecordingError` or `ModelError` if a file cannot be read.
         """
         from ..recording import read
 
@@ -58,15 +58,15 @@ def described(path: Path) -> dict[str, Any]:
     try:
         told = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise ModelError(f"there is no file {path}: jaxid inspect --write makes one") from error
+        raise ModelError(f"there is no file {path}: jaxid inspect --write creates one") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ModelError(f"{path} is no TOML ({error}): mend that line") from error
+        raise ModelError(f"{path} is not valid TOML ({error}): correct that line") from error
     for key, value in told.items():
         if not isinstance(value, known.get(key, ())):
             raise ModelError(
-                f"{path} has {key!r}{near(key, known)}: give tables [columns], [units] and "
-                '[scale], lists joints and resolution, and gaps = "allow", nan = "drop" or '
-                'clock = "even"'
+                f"{path} has an unexpected {key!r}{near(key, known)}: allowed are the tables "
+                "[columns], [units] and [scale], the lists joints and resolution, and gaps = "
+                '"allow", nan = "drop" and clock = "even"'
             )
     return told
 
@@ -85,7 +85,7 @@ def _pairs(given: list[str] | None, what: str) -> dict[str, str] | None:
     for item in given:
         name, equals, value = item.partition("=")
         if not equals:
-            raise ModelError(f"--{what} {item!r} has no '=': write for instance q=pos_1,pos_2")
+            raise ModelError(f"--{what} {item!r} has no '=': write, for example, q=pos_1,pos_2")
         pairs[name.strip()] = value.strip()
     return pairs
 
@@ -110,6 +110,6 @@ def check_outputs(*paths: Path | None) -> None:
     """Checks before the computation that results can be written."""
     for path in paths:
         if path is not None and not path.resolve().parent.is_dir():
-            raise ModelError(f"there is no folder {path.parent} for {path.name}: make it first")
+            raise ModelError(f"there is no folder {path.parent} for {path.name}: create it first")
         if path is not None and path.is_dir():
             raise ModelError(f"{path} is a folder: name a file in it")

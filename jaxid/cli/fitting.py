@@ -50,7 +50,7 @@ def fit(
       jaxid fit run.mat --robot emps --method idim
       jaxid fit run.csv --robot my_robot.py:loop --column q=pos_a,pos_b --unit q=deg
 
-    The exit code is 0, 1 where the fit did not converge, 2 where something given cannot be used.
+    The exit code is 0, 1 if the fit did not converge, 2 if an input cannot be used.
     """
     from .. import estimate
 
@@ -71,7 +71,7 @@ def fit(
         if method not in methods:
             raise ModelError(f"there is no method {method!r}: choose {', '.join(methods)}")
         if window is not None and method not in ("oem", "pem"):
-            raise ModelError(f"--method {method} simulates nothing in windows: leave out --window")
+            raise ModelError(f"--method {method} does not simulate windows: leave out --window")
         loop = with_controller(load_robot(robot), controller)
         reading = ReadOptions(column, unit, log, gaps, clock, drop_nan)
         found = estimate.fit(loop, reading(files), methods[method]())
@@ -96,7 +96,7 @@ def compare(
         Path | None,
         typer.Option(
             "--fit",
-            help="Values that `jaxid fit --json` wrote, or a model that `discover --save` did.",
+            help="Values written by `jaxid fit --json`, or a model written by `discover --save`.",
         ),
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="Write the figure to this HTML file.")] = None,
@@ -106,7 +106,7 @@ def compare(
     window: Window = None,
     quiet: Quiet = False,
 ) -> None:
-    """Hold a model against recordings: relative errors, and a figure.
+    """Compare a model with recordings: relative errors, and a figure.
 
     \b
     Examples:
@@ -114,7 +114,7 @@ def compare(
       jaxid compare new.csv --fit story.jaxid
       jaxid compare run.csv --robot my_robot.py:loop --json errors.json
 
-    The exit code is 0, or 2 where something given cannot be used.
+    The exit code is 0, or 2 if an input cannot be used.
     """
     from ..discovery import compare as run_compare
 

@@ -29,25 +29,25 @@ def discover_all(
         Path | None, typer.Option(help="Keep each result in this folder, and continue from there.")
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option(help="Robots at a time; by default the cores.")
+        int | None, typer.Option(help="Robots at a time; by default the number of cores.")
     ] = None,
     worth: Annotated[
-        float, typer.Option(help="What is worth knowing: share of a joint's torque, %.")
+        float, typer.Option(help="Leave out effects below this share of each joint's torque, %.")
     ] = 0.05,
     controller: Controller = None,
     quiet: Quiet = False,
 ) -> None:
     """Find what the models of many robots lack, and show them in one table.
 
-    Files are named from the table's folder. A robot that fails has its reason in the table and
-    stops none of the others.
+    File names are relative to the folder of the table. If a robot fails, the others are still
+    examined, and the reason is shown.
 
     \b
     Examples:
       jaxid discover-all fleet.csv --csv found.csv --resume steps
       jaxid discover-all fleet.csv --jobs 8 --json found.json
 
-    The exit code is 0, 1 where a robot failed, 2 where something given cannot be used.
+    The exit code is 0, 1 if a robot failed, 2 if an input cannot be used.
     """
     from ..discovery import discover_all as run_all
 
@@ -80,8 +80,8 @@ def _problems(table: Path, controller: str | None) -> tuple[dict[str, Any], dict
     for column in rows.columns:
         if column not in _COLUMNS:
             raise ModelError(
-                f"{table} has a column {column!r}{near(column, _COLUMNS)}: give "
-                f"{', '.join(_COLUMNS)}"
+                f"{table} has an unknown column {column!r}{near(column, _COLUMNS)}: the columns "
+                f"are {', '.join(_COLUMNS)}"
             )
     absent = [c for c in _COLUMNS[:3] if c not in rows.columns]
     if absent:

@@ -39,7 +39,7 @@ def inspect(
     write: Annotated[
         Path | None,
         typer.Option(
-            help="Write columns, units and scales to this TOML file, to be edited: for --log."
+            help="Write columns, units and scales to this TOML file; edit it, then use --log."
         ),
     ] = None,
     plot: Annotated[
@@ -55,7 +55,7 @@ def inspect(
       jaxid inspect run_1.csv --write log.toml
       jaxid inspect bag_folder --log log.toml --plot run_1.html
 
-    The exit code is 0, or 2 where the files cannot be used as they are described.
+    The exit code is 0, or 2 if the files cannot be read as described.
     """
     from ..recording import contents_of
     from ..signals.inspection import inspect as look
@@ -72,10 +72,10 @@ def inspect(
             guessed = guess(found.columns)
             if column is not None or log is not None or not guessed:
                 raise
-            typer.echo(f"not read as it is: {error}")
+            typer.echo(f"not readable without options: {error}")
             units = (unit or []) + _pairs(guess_units(guessed, unit or []))
             reading = ReadOptions(_pairs(guessed), units, log, gaps, clock, drop_nan)
-            typer.echo(f"taken for now: {'  '.join(_pairs(guessed) + units)}")
+            typer.echo(f"assumed: {'  '.join(_pairs(guessed) + units)}")
             recordings = reading(files)
             found = contents_of(files[0], **_named(reading))
         if found.joints:
@@ -136,13 +136,13 @@ def diagnose(
     controller: Controller = None,
     quiet: Quiet = False,
 ) -> None:
-    """Rank what the fitted model may lack, without refitting: quicker than discover, and rougher.
+    """Rank effects that the model may lack, from one fit: faster than discover, less accurate.
 
     \b
     Example:
       jaxid diagnose run_1.csv run_2.csv --robot arm.urdf
 
-    The exit code is 0, 1 where the fit did not converge, 2 where something given cannot be used.
+    The exit code is 0, 1 if the fit did not converge, 2 if an input cannot be used.
     """
     from ..discovery import diagnose as run_diagnose
     from ..effects import catalogue as known

@@ -16,9 +16,9 @@ def load_robot(robot: str | None) -> Any:
     **Arguments:**
 
     - `robot`: `scara`, `two-link`, `emps`, a URDF file, or `path/to/file.py:name` of a loop, or of
-      a function without arguments that returns one; None if the user named none.
+      a function without arguments that returns one; None if the user gave none.
 
-    **Raises:** `ModelError` that says what was not found.
+    **Raises:** `ModelError` if there is no such robot or its file cannot be used.
     """
     from .. import robots
     from ..simulation.loop import ClosedLoop
@@ -26,7 +26,7 @@ def load_robot(robot: str | None) -> Any:
     ready = {"scara": robots.scara, "two-link": robots.two_link, "emps": robots.emps}
     if robot is None:
         raise ModelError(
-            "no robot is named: give --robot FILE.urdf, --robot FILE.py:NAME of a loop of your "
+            "no robot is given: use --robot FILE.urdf, --robot FILE.py:NAME of a loop of your "
             f"own, or one of {', '.join(ready)}"
         )
     if robot in ready:
@@ -59,11 +59,13 @@ def load_effect(given: str) -> Any:
 
     - `given`: `path/to/file.py:Name`.
 
-    **Raises:** `ModelError` that says what was not found.
+    **Raises:** `ModelError` if there is no such class or its file cannot be used.
     """
     path, _, name = given.rpartition(":")
     if not path.endswith(".py"):
-        raise ModelError(f"--catalogue {given!r} names no effect: give FILE.py:NAME of its class")
+        raise ModelError(
+            f"--catalogue {given!r} does not name an effect: give FILE.py:NAME of its class"
+        )
     module = _module(path)
     if not hasattr(module, name):
         raise ModelError(f"{path} has no effect called {name!r}: name the class it defines")
@@ -76,7 +78,7 @@ def _module(path: str) -> Any:
         raise ModelError(f"there is no file {path}: give the path of your own Python file")
     known, stamp = sys.modules.get(Path(path).stem), Path(path).stat().st_mtime_ns
     mine = known is not None and getattr(known, "__file__", None) == path
-    # A file that is named again gives the same classes, unless it has changed in between.
+    # A file that is loaded again must give the same classes, unless it has changed in between.
     if mine and getattr(known, "_read_at", None) == stamp:
         return known
     spec = importlib.util.spec_from_file_location(Path(path).stem, path)
@@ -91,7 +93,7 @@ def _module(path: str) -> Any:
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise ModelError(f"{path} fails when it is imported ({error!r}): mend it first") from error
+        raise ModelError(f"{path} cannot be imported ({error!r}): correct it first") from error
     return module
 
 
@@ -110,7 +112,7 @@ def with_controller(loop: Any, controller: str | None) -> Any:
 
 
 def saved_model(robot: str | None, path: Path | None, own: frozenset[type] = frozenset()) -> Any:
-    """The robot with values written by an earlier command, or the model that it wrote.
+    """The robot with values from the JSON of an earlier command, or a model that was saved.
 
     **Arguments:**
 
@@ -127,7 +129,7 @@ def saved_model(robot: str | None, path: Path | None, own: frozenset[type] = fro
         theirs = frozenset() if robot is None else classes_of(load_robot(robot))
         saved = load(path, theirs | own)
         if not hasattr(saved, "loop"):
-            raise ModelError(f"{path} holds no model: give a saved fit or story")
+            raise ModelError(f"{path} contains no model: give a saved fit or story")
         return saved.loop
     loop = load_robot(robot)
     try:
@@ -135,7 +137,7 @@ def saved_model(robot: str | None, path: Path | None, own: frozenset[type] = fro
         found = {name: float(entry["value"]) for name, entry in parameters.items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ModelError(
-            f"{path} holds no fitted parameters ({error!r}): give a file that "
+            f"{path} contains no fitted parameters ({error!r}): give a file that "
             "`jaxid fit --json` or `jaxid discover --save` wrote"
         ) from error
     return loop.with_values(**found)

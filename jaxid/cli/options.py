@@ -21,26 +21,30 @@ Robot = Annotated[
 Json = Annotated[Path | None, typer.Option("--json", help="Also write the result here.")]
 Column = Annotated[
     list[str] | None,
-    typer.Option("--column", help="Our name=theirs, as q=pos_1,pos_2; once for each signal."),
+    typer.Option(
+        "--column", help="Signal=columns of the file, such as q=pos_1,pos_2; once for each signal."
+    ),
 ]
 Unit = Annotated[
     list[str] | None,
     typer.Option(
-        "--unit", help="Unit of a signal that is not SI, as q=deg, or one per joint: q=deg,mm."
+        "--unit",
+        help="Unit of a signal if it is not SI, such as q=deg, or one per joint: q=deg,mm.",
     ),
 ]
 Log = Annotated[
     Path | None,
     typer.Option(
-        "--log", help="Columns, units, scales in a TOML file, as of jaxid inspect --write."
+        "--log",
+        help="TOML file of columns, units and scales, as written by jaxid inspect --write.",
     ),
 ]
 Gaps = Annotated[
-    Literal["refuse", "allow"], typer.Option(help="Missing stretches of time in a recording.")
+    Literal["refuse", "allow"], typer.Option(help="What to do if a recording has gaps in time.")
 ]
 Clock = Annotated[
     Literal["recorded", "even"],
-    typer.Option(help="Times as recorded, or even where those of a logger jitter."),
+    typer.Option(help="Times as recorded, or evenly spaced if those of a logger jitter."),
 ]
 DropNan = Annotated[
     bool, typer.Option("--drop-nan", help="Leave out samples at which a signal is empty.")
@@ -50,16 +54,12 @@ Controller = Annotated[
     str | None,
     typer.Option(help="tracking (the real law is unknown) or open-loop (recorded torque)."),
 ]
-Window = Annotated[
-    float | None, typer.Option(help="Simulate pieces of this length on their own, s.")
-]
+Window = Annotated[float | None, typer.Option(help="Simulate pieces of this length separately, s.")]
 Report = Annotated[
-    Path | None, typer.Option(help="Write the story to this HTML file, which needs no network.")
+    Path | None, typer.Option(help="Write the story to this self-contained HTML file.")
 ]
 Catalogue = Annotated[
     list[str] | None,
-    typer.Option(help="FILE.py:NAME of an effect of your own, asked beside the known ones."),
+    typer.Option(help="FILE.py:NAME of your own effect, examined in addition to the known ones."),
 ]
-Quiet = Annotated[
-    bool, typer.Option("--quiet", "-q", help="No progress, and the result in a line.")
-]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress; the result in one line.")]

@@ -31,8 +31,8 @@ def tell(story: Any, quiet: bool = False) -> None:
 
 
 LEGEND = """
-relative error: norm of measured less simulated torque, over norm of measured torque
-fit, held out:  recordings that were fitted, and one that no fit has seen
+relative error: norm of measured minus simulated torque, over norm of measured torque
+fit, held out:  recordings that were fitted, and one that was not
 noise floor:    the error that a perfect model would leave
 ±:              one standard deviation"""
 
@@ -45,7 +45,7 @@ def error_falls(story: Any) -> None:
     held = table[[name for name in table.columns if name.startswith("held out")]]
     worst = str(held.iloc[0].idxmax())
     error = held[worst]
-    typer.echo(f"\nerror on the recording that no fit saw ({worst.removeprefix('held out, ')}):")
+    typer.echo(f"\nerror on the held-out recording ({worst.removeprefix('held out, ')}):")
     width = max(len(str(step)) for step in error.index)
     for step, value in error.items():
         bar = "█" * max(1, round(30 * value / error.max()))

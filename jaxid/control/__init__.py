@@ -1,4 +1,4 @@
-"""Controllers: they act on what the sensor reads."""
+"""Controllers, which act on the readings of the sensors."""
 
 from ._base import AbstractController as AbstractController
 from ._base import Reading as Reading

@@ -14,7 +14,7 @@ from ..recording import Recording
 
 
 class Reading(eqx.Module):
-    """What the sensors report: position and velocity, `(joints,)`, rad or m and per s."""
+    """Readings of the sensors: position and velocity, `(joints,)`, rad or m and per s."""
 
     q: Float[Array, " joints"]
     v: Float[Array, " joints"]
@@ -24,7 +24,7 @@ class Reference(eqx.Module):
     """The reference of the controller; every vector is `(joints,)`.
 
     `q`, `v`, `a`: the reference motion. `tau`: known torque added to the output, N·m or N. `held`:
-    what the drives were told or fed with the last sample, by its name in `Recording` (`kp`, ...).
+    commands and supply of the drives at the last sample, by the names in `Recording` (`kp`, ...).
     """
 
     q: Float[Array, " joints"]
@@ -37,7 +37,8 @@ class Reference(eqx.Module):
 class Signals(eqx.Module):
     """Inputs of a controller from a recording, at its sample times, `(samples, joints)`.
 
-    `hold`: whether they hold until the next sample, however a loop interpolates references.
+    `hold`: whether they are constant until the next sample, even if the loop interpolates
+    references.
     """
 
     q: Float[np.ndarray, "samples joints"]
@@ -87,9 +88,9 @@ class AbstractController(eqx.Module):
 
     @property
     def judged(self) -> Literal["torque", "position"]:
-        """What says how good a model under this law is; torque by default.
+        """The signal by which a model under this law is judged; torque by default.
 
-        Position, where what is recorded in place of a torque follows from the position alone.
+        Position, if the signal recorded as torque follows from the position alone.
         """
         return "torque"
 
@@ -100,16 +101,16 @@ class AbstractController(eqx.Module):
 
     @property
     def imposes(self) -> bool:
-        """Whether the motion is imposed: it is the reference, and torque is inverse dynamics.
+        """Whether the motion is imposed: the motion is the reference, torque is inverse dynamics.
 
-        Only a virtual law can do so.
+        Only a virtual law can impose it.
         """
         return False
 
     def comparable(self, recording: Recording) -> float | None:
         """Frequency up to which measured and simulated torque may be compared, Hz; None for all.
 
-        If there is one, both pass the same low-pass first, the ends of a recording are left out,
+        If there is one, the same low-pass is applied to both, the ends of a recording are left out,
         and the loop starts on its reference.
         """
         return None
@@ -121,7 +122,7 @@ class AbstractController(eqx.Module):
 
         **Arguments:**
 
-        - `cutoff`: up to which measured and simulated torque are compared, Hz.
+        - `cutoff`: frequency up to which measured and simulated torque are compared, Hz.
         """
         return None
 
@@ -132,7 +133,7 @@ class AbstractController(eqx.Module):
     def signals(self, recording: Recording) -> Signals:
         """Reference and known torque, taken from a recording.
 
-        **Raises:** `ModelError` where the recording has no reference.
+        **Raises:** `ModelError` if the recording has no reference.
         """
         if recording.q_ref is None:
             raise ModelError(

@@ -17,7 +17,7 @@ from ..errors import ModelError, require
 from ..parameters import list_parameters, read_values, write_values
 from .computed_torque import Body, ComputedTorque
 
-# Margin for points between those at which the bound was computed.
+# Margin for points between those for which the bound was computed.
 _MARGIN = 1.02
 
 
@@ -45,12 +45,12 @@ def _box(
                     f"there is no parameter {name!r} in this arm: it has {', '.join(names)}"
                 )
             if not low <= high:
-                raise ModelError(f"{name} goes from {low:g} to {high:g}: exchange the two")
+                raise ModelError(f"{name} is between {low:g} and {high:g}: exchange the two")
         chosen = [p for p in parameters if p.name in spread]
         low, high = (np.array([spread[p.name][k] for p in chosen], float) for k in (0, 1))
         return chosen, low, high
     if not 0 <= spread < 1:
-        raise ModelError(f"a spread of {spread:g} is no share of the parameters: give 0.2 for 20 %")
+        raise ModelError(f"spread is {spread:g}: give a share of the parameters, 0.2 for 20 %")
     values = np.asarray(read_values(arm, parameters))
     reach = np.abs(values) * spread
     return parameters, values - reach, values + reach
@@ -64,14 +64,14 @@ def mass_error(
     draws: int = 4000,
     seed: int = 0,
 ) -> MassError:
-    """The mass-matrix error over the workspace, of arms whose parameters lie in a box.
+    """The mass-matrix error over the workspace, for arms whose parameters lie in a box.
 
-    Computed in every corner of the box and at random points inside, at all poses. The bound is the
-    mu of smallest trace above all of them, plus 2 % for points between.
+    It is computed in every corner of the box and at random points inside, at all poses. The bound
+    is the mu of smallest trace above all of these, plus 2 % for points between them.
 
     **Arguments:**
 
-    - `model`: the arm as the controller takes it to be, a module with declared parameters.
+    - `model`: the arm as the controller models it, a module with declared parameters.
     - `workspace`: poses, `(points, joints)`; for instance `arm.workspace()`.
     - `spread`: share of each parameter by which the true one may differ, or its lowest and highest
       value by name.
@@ -113,7 +113,7 @@ def mass_error(
 def _smallest_above(
     squares: Float[np.ndarray, "points n n"], rng: np.random.Generator
 ) -> Float[np.ndarray, "n n"]:
-    """The matrix of least trace above all of these, from the extreme ones."""
+    """The matrix of least trace above all of these, computed from the extreme ones."""
     cvxpy = require("cvxpy", "sdp")
     require("clarabel", "sdp")
     n = squares.shape[1]
@@ -127,7 +127,7 @@ def _smallest_above(
     problem.solve(solver=cvxpy.CLARABEL)
     found = np.asarray(mu.value)
     floor = 1e-9 * np.eye(n)
-    # Scaled up to include what the program's tolerance left out.
+    # Scaled up to include points that are outside by the program's tolerance.
     half = np.linalg.cholesky(found + floor)
     passed = np.linalg.solve(half, np.swapaxes(np.linalg.solve(half, squares), 1, 2))
     return max(1.0, float(np.linalg.eigvalsh(passed).max())) * (found + floor)
@@ -141,9 +141,9 @@ class Certificate(eqx.Module):
     x'Px decreases for every M~ with M~ M~' ⪯ mu. The proof does not cover sampling. Disturbances
     cause errors in proportion to their size.
 
-    - `certified`: False is no proof of instability.
+    - `certified`: whether stability is proved; False does not prove instability.
     - `reason`: a sentence.
-    - `P`, `Q`, `epsilon`: the certificate, None where there is none. `mu`: the bound.
+    - `P`, `Q`, `epsilon`: the certificate, None if there is none. `mu`: the bound.
     """
 
     certified: bool = eqx.field(static=True)
@@ -176,7 +176,7 @@ def certify(law: ComputedTorque, error: MassError) -> Certificate:
 
     **Arguments:**
 
-    - `law`: whose gains are judged.
+    - `law`: the law with the gains to examine.
     - `error`: bound on the mass-matrix error, from `mass_error`.
 
     **Raises:** `MissingExtraError` without the extra `sdp`.
@@ -241,7 +241,7 @@ def holds(certificate: Certificate, law: ComputedTorque) -> bool:
     c = certificate
     if not c.certified or c.P is None or c.Q is None or c.epsilon is None or c.epsilon <= 0:
         return False
-    # Balanced, since states of different units would hide a small eigenvalue behind a large one.
+    # Balanced, because with states of different units a small eigenvalue is lost in rounding.
     size = np.sqrt(np.diag(c.P))
     exact = bool(np.abs(_left(law, c.mu, c.P, c.epsilon) - c.Q).max() <= 1e-9 * np.abs(c.Q).max())
     return exact and all(positive(x / np.outer(size, size)) for x in (c.P, c.Q))

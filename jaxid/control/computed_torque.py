@@ -29,15 +29,15 @@ class Body(Protocol):
 class ComputedTorque(AbstractController):
     """tau = M̂ (a_ref + Kd e' + Kp e + Ki ∫e) + ĥ(q, v), with e = q_ref - q.
 
-    M̂ and ĥ are those of `model`, whose values a fit leaves alone (Li, Peng, Juang 2023).
+    M̂ and ĥ are those of `model`, whose values a fit does not change (Li, Peng, Juang 2023).
 
     **Arguments:**
 
     - `model`: the model of the arm inside the law.
     - `Kp`, `Ki`, `Kd`: gains, `(joints,)`, 1/s², 1/s³ and 1/s.
-    - `every`: period, s, of a law that computes with encoders alone: velocity is the difference
-      of readings `window` ticks apart, and the torque holds until the next tick. None for a
-      continuous law that is given velocities.
+    - `every`: period, s, of a sampled law that has encoders only: velocity is the difference of
+      readings `window` ticks apart, and the torque is constant until the next tick. None for a
+      continuous law with measured velocities.
     - `window`: ticks.
     """
 

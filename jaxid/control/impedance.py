@@ -16,8 +16,8 @@ from .pd import _vector
 class Impedance(AbstractController):
     """tau = clip(kp (q_ref - q) + kd (v_ref - v) + tau_ff, ±limit), commanded by the recording.
 
-    Position, velocity, both gains and torque are commanded with every sample and hold until the
-    next, as on the bus of Mini Cheetah's actuators and of others that use its protocol (Katz 2018).
+    Position, velocity, both gains and torque are commanded with every sample and are constant until
+    the next, as for actuators with the protocol of Mini Cheetah (Katz 2018).
     While the drive is off (`on`), it gives no torque.
 
     **Arguments:**
@@ -35,8 +35,8 @@ class Impedance(AbstractController):
         for name in ("kp", "kd"):
             if getattr(recording, name) is None:
                 raise ModelError(
-                    f"{recording.name} has no {name}, which Impedance takes from it: name its "
-                    f"column, or give the number that holds for all of it ({name}=...)"
+                    f"{recording.name} has no {name}, which Impedance needs: name its column, or "
+                    f"give one number for the recording ({name}=...)"
                 )
         return dataclasses.replace(super().signals(recording), hold=True)
 

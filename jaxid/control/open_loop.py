@@ -14,7 +14,7 @@ class OpenLoop(AbstractController):
 
     @property
     def judged(self) -> Literal["torque", "position"]:
-        """Position: the recorded torque is what drives it."""
+        """Position, because the recorded torque is the input."""
         return "position"
 
     def command(

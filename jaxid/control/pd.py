@@ -18,8 +18,8 @@ class PD(AbstractController):
 
     **Arguments:**
 
-    - `Kp`, `Kv`: gains, `(joints,)`, N·m/rad and N·m·s/rad (N/m and N·s/m where a joint slides);
-      1/s² and 1/s where `Kg` is given.
+    - `Kp`, `Kv`: gains, `(joints,)`, N·m/rad and N·m·s/rad (N/m and N·s/m for a sliding joint);
+      1/s² and 1/s if `Kg` is given.
     - `Kg`: `(joints,)`, kg·m² (or kg); 1 by default.
     """
 

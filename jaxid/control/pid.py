@@ -11,12 +11,12 @@ from .pd import _vector
 class PID(AbstractController):
     """tau = Kp e + Ki ∫e + Kd e' + tau_ff, with e = q_ref - q and e' = v_ref - v.
 
-    `Sampled(PID(...), every=...)` is the law of a drive, with anti-windup where it has a limit.
+    `Sampled(PID(...), every=...)` is the law of a drive, with anti-windup if it has a limit.
 
     **Arguments:**
 
-    - `Kp`, `Ki`, `Kd`: gains, `(joints,)`, N·m/rad, N·m/(rad·s) and N·m·s/rad; of a joint that
-      slides N/m, N/(m·s) and N·s/m.
+    - `Kp`, `Ki`, `Kd`: gains, `(joints,)`, N·m/rad, N·m/(rad·s) and N·m·s/rad; for a sliding joint
+      N/m, N/(m·s) and N·s/m.
     """
 
     Kp: Float[Array, " joints"] = eqx.field(converter=_vector)

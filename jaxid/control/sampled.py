@@ -1,4 +1,4 @@
-"""A continuous law as a drive computes it: at ticks, from encoders, with a delay."""
+"""A continuous law in the form in which a drive computes it: sampled, with encoders and delay."""
 
 from typing import Literal
 
@@ -22,13 +22,13 @@ class Sampled(AbstractController):
 
     **Arguments:**
 
-    - `law`: a continuous controller, with states or without.
+    - `law`: a continuous controller, with or without states.
     - `every`: period, s.
-    - `delay`: how many periods later a command acts.
-    - `resolution`: of the encoders, rad or m, `(joints,)`; zero for exact readings. The
-      derivative of the rounding is taken as one.
+    - `delay`: number of periods after which a command acts.
+    - `resolution`: resolution of the encoders, rad or m, `(joints,)`; zero for exact readings. The
+      derivative of the rounding is set to one.
     - `velocity`: `"measured"`, or the `"difference"` of readings `window` ticks apart.
-    - `cutoff`: of a first-order low-pass on the velocity, Hz; None for none.
+    - `cutoff`: cutoff of a first-order low-pass on the velocity, Hz; None for no low-pass.
     - `limit`: largest torque, `(joints,)`, N·m or N. States of a joint whose torque is at the
       limit are held (conditional integration, Åström and Hägglund 2006).
     """
@@ -45,14 +45,14 @@ class Sampled(AbstractController):
     def __check_init__(self) -> None:
         if self.law.period is not None or self.law.pace > 0:
             raise ModelError(
-                f"Sampled holds a continuous law, and {type(self.law).__name__} is none: give the "
-                "continuous law that the drive computes, such as PD or PID"
+                f"{type(self.law).__name__} cannot be the law of Sampled: give the continuous law "
+                "that the drive computes, such as PD or PID"
             )
         if self.every <= 0 or self.delay < 0 or self.window < 1:
             raise ModelError(
-                f"a law sampled every {self.every:g} s, {self.delay} periods late, with velocity "
-                f"over {self.window} ticks cannot be simulated: give a period above zero, a delay "
-                "of 0 or more and a window of 1 or more"
+                f"a law with a period of {self.every:g} s, a delay of {self.delay} periods and a "
+                f"window of {self.window} ticks cannot be simulated: give a period above zero, a "
+                "delay of 0 or more and a window of 1 or more"
             )
 
     @property
@@ -62,18 +62,18 @@ class Sampled(AbstractController):
 
     @property
     def judged(self) -> Literal["torque", "position"]:
-        """As the law that is sampled."""
+        """The same as for the continuous law."""
         return self.law.judged
 
     def signals(self, recording: Recording) -> Signals:
-        """What the law that is sampled takes, `(samples, joints)`."""
+        """The inputs of the continuous law, `(samples, joints)`."""
         return self.law.signals(recording)
 
     def _past(self) -> int:
         return self.window if self.velocity == "difference" else 0
 
     def initial_state(self, reading: Reading) -> Float[Array, " states"]:
-        """The law's states, no torque yet, the last readings, newest first, and the velocity."""
+        """The law's states, zero torque, the last readings, newest first, and the velocity."""
         zero = jnp.zeros_like(reading.q)
         past = [reading.q - k * self.every * reading.v for k in range(1, self._past() + 1)]
         own = self.law.initial_state(reading)
@@ -81,7 +81,7 @@ class Sampled(AbstractController):
         return jnp.concatenate([own, *[zero] * (1 + self.delay), *past, *slow])
 
     def _parts(self, state: Float[Array, " states"], joints: int) -> list[Float[Array, " _"]]:
-        """The law's states, then the others joint by joint."""
+        """The law's states, then the other states by joint."""
         others = 1 + self.delay + self._past() + (self.cutoff is not None)
         first = state.shape[0] - others * joints
         return jnp.split(state, [first + k * joints for k in range(others)])
@@ -114,7 +114,7 @@ class Sampled(AbstractController):
         torque = self.law.command(seen, reference, after, identity)
         if own.shape[0]:
             full = jnp.abs(torque) > limit
-            # States of joints are held one by one; other states where any joint is at its limit.
+            # A joint's states are held if it is at its limit, other states if any joint is.
             stay = jnp.tile(full, own.shape[0] // n) if own.shape[0] % n == 0 else jnp.any(full)
             after = jnp.where(stay, own, after)
             torque = self.law.command(seen, reference, after, identity)

@@ -1,4 +1,4 @@
-"""A position servo that drives its motor by duty cycle, as hobby servos and smart actuators do."""
+"""A position servo that commands a duty cycle, such as hobby servos and smart actuators."""
 
 import dataclasses
 from typing import Literal
@@ -16,11 +16,11 @@ from .pd import _vector
 class Servo(AbstractController):
     """volts = supply · clip(gain kp e - damping v, ±duty), with e = q_ref - q beyond the deadband.
 
-    The recorded `tau` is in volts, and `jaxid.effects.DCMotor` converts it to torque. Since the
-    voltage follows from the position, fits compare positions. `kp` is taken from the recording if
-    it has one, and is 1 otherwise; so is `supply`. While the recording says that the drive is off
-    (`on`), it gives no voltage. Goals hold from sample to sample. `Sampled(Servo(...), every=...)`
-    is a servo that computes its law at ticks.
+    The recorded `tau` is in volts, and `jaxid.effects.DCMotor` converts it to torque. The voltage
+    follows from the position, so fits compare positions. `kp` is taken from the recording if it has
+    one, and is 1 otherwise. A recorded `supply` replaces the argument. While the drive is off (`on`
+    in the recording), the voltage is zero. Goals are constant from sample to sample.
+    `Sampled(Servo(...), every=...)` is a servo with a sampled law.
 
     **Arguments:**
 
@@ -39,7 +39,7 @@ class Servo(AbstractController):
 
     @property
     def judged(self) -> Literal["torque", "position"]:
-        """Position: the voltage is a gain times its error."""
+        """Position, because the voltage is a gain times its error."""
         return "position"
 
     def signals(self, recording: Recording) -> Signals:

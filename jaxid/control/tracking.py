@@ -17,25 +17,25 @@ class Tracking(AbstractController):
     """tau = M (a_m + 2 zeta w (v_m - v) + w² (q_m - q)) + h: follows the recorded motion q_m.
 
     Torque is that of inverse dynamics along the recorded motion: M is the model's mass matrix, and
-    h all other torque that the model needs, friction included. If no effect makes the arm deviate
-    from q_m, the motion is imposed and nothing is simulated. Otherwise the loop is simulated and
-    feedback corrects the deviation; simulated and measured torque can be compared as long as both
-    track alike (Gautier, Janot, Vandanjon 2013). The recorded motion is low-passed forward and
-    backward, so that differentiation does not amplify noise. Measured and simulated torque pass the
-    same filter before they are compared (the parallel filter of Gautier 1997).
+    h is all other torque that the model needs, including friction. If no effect makes the arm
+    deviate from q_m, the motion is imposed and nothing is simulated. Otherwise the loop is
+    simulated and feedback corrects the deviation. Simulated and measured torque can be compared if
+    both loops track equally well (Gautier, Janot, Vandanjon 2013). The recorded motion is
+    low-passed forward and backward before differentiation. The same filter is applied to measured
+    and simulated torque before they are compared (the parallel filter of Gautier 1997).
 
     **Arguments:**
 
-    - `bandwidth`: of the virtual loop, Hz; must be above `cutoff`.
-    - `damping`: ratio of the virtual loop.
+    - `bandwidth`: bandwidth of the virtual loop, Hz; must be above `cutoff`.
+    - `damping`: damping ratio of the virtual loop.
     - `delay`: time by which torque acts later than recorded, s. It is half a period for a law that
       is computed at every sample and held in between.
-    - `cutoff`: of the low-pass, Hz. By default the frequency above which the recorded motion is
-      noise; a fit uses the lowest of its recordings.
-    - `still`: share of its highest speed below which a joint counts as standing still. Static
-      friction is then any torque up to the breakaway torque, and motion does not determine it, so
-      the torque of such samples, and of those within a period of the cutoff (at least 30 ms), is
-      not compared. Zero compares all samples.
+    - `cutoff`: cutoff of the low-pass, Hz. By default the frequency above which the recorded motion
+      is noise; a fit uses the lowest of its recordings.
+    - `still`: share of its highest speed below which a joint counts as standing still. Motion does
+      not determine static friction, which may be any torque up to the breakaway torque. The torque
+      of such samples, and of samples within a period of the cutoff (at least 30 ms) from them, is
+      therefore not compared. Zero compares all samples.
     """
 
     bandwidth: float = 40.0
@@ -51,7 +51,7 @@ class Tracking(AbstractController):
 
     @property
     def imposes(self) -> bool:
-        """True, so that torque does not lag behind the motion."""
+        """True; torque then does not lag behind the motion."""
         return True
 
     def command(
@@ -67,7 +67,7 @@ class Tracking(AbstractController):
         return mass @ (reference.a + rate + w**2 * (reference.q - reading.q)) + reference.tau
 
     def comparable(self, recording: Recording) -> float:
-        """The low-pass's cutoff, Hz."""
+        """Cutoff of the low-pass, Hz."""
         return self.cutoff or signal_cutoff(recording)
 
     def moving(
@@ -82,7 +82,7 @@ class Tracking(AbstractController):
         time = even_times(recording)
         speed = np.gradient(smooth_motion(recording, cutoff), time, axis=0)
         standing = np.abs(speed) < self.still * np.abs(speed).max(axis=0)
-        # A fast reversal falls between two samples.
+        # A fast reversal may be between two samples.
         turns = speed[1:] * speed[:-1] < 0
         standing[1:] |= turns
         standing[:-1] |= turns
@@ -90,20 +90,20 @@ class Tracking(AbstractController):
         return np.stack([_far_from(column, memory) for column in standing.T], axis=1)
 
     def settled(self, recordings: Iterable[Recording]) -> "Tracking":
-        """The controller with one cutoff for all recordings: the lowest of theirs."""
+        """The controller with one cutoff for all recordings: the lowest of their cutoffs."""
         return dataclasses.replace(self, cutoff=min(map(self.comparable, recordings)))
 
     def signals(self, recording: Recording) -> Signals:
         """The low-passed recorded motion, `(samples, joints)`."""
         smooth = smooth_motion(recording, self.comparable(recording))
         times = even_times(recording)
-        # Torque belongs to the motion at the time it acts; at the end that motion is not known.
+        # Torque belongs to the motion at the time at which it acts; that is unknown at the end.
         at = np.clip(recording.time + self.delay, times[0], times[-1])
         q = resampled(times, smooth, at)
         return Signals(q, np.zeros_like(recording.tau))
 
 
-# Time that dry friction takes to build up after a reversal, s, whatever the cutoff.
+# Time in which dry friction builds up after a reversal, s, for any cutoff.
 _PRESLIDING = 0.03
 # Smallest share of a joint's moving samples that is compared.
 _LEAST = 0.6
@@ -114,7 +114,7 @@ def _far_from(there: Bool[np.ndarray, " samples"], reach: float) -> Bool[np.ndar
     import scipy
 
     if there.mean() > 0.95:
-        # A joint that is held still: only its noise can be compared.
+        # The joint does not move: only its noise can be compared.
         return np.ones_like(there)
     for part in (1.0, 0.5, 0.25):
         width = 2 * round(part * reach) + 1

@@ -55,5 +55,5 @@ def check_apart(recordings: Recordings, held_out: Iterable[Recording]) -> None:
             if np.array_equal(unseen.q, fitted.q) and np.array_equal(unseen.tau, fitted.tau):
                 raise RecordingError(
                     f"{unseen.name} is held out and has the samples of {fitted.name}, which is "
-                    "fitted: what judges a model must not have made it"
+                    "fitted: a model must be tested on recordings to which it was not fitted"
                 )

@@ -49,8 +49,8 @@ def likely_cause(loop: ClosedLoop, recordings: Recordings) -> str:
     if not size < _SHARE * np.mean(before**2):
         return ""
     return (
-        f"{said}: with that undone a regression leaves {np.sqrt(size):.2g} % of the torque, "
-        f"and {np.sqrt(np.mean(before**2)):.3g} % as it is"
+        f"{said}: with this corrected, the error of a regression is {np.sqrt(size):.2g} % instead "
+        f"of {np.sqrt(np.mean(before**2)):.3g} %"
     )
 
 
@@ -92,14 +92,14 @@ def _mistakes(recordings: Recordings) -> Iterator[tuple[str, Recordings]]:
     chosen = [(f"joint {j + 1}", np.eye(n)[j]) for j in range(n)] + several
     for label, which in chosen:
         yield (
-            f"the torque of {label} looks as if its sign were turned",
+            f"the torque of {label} seems to have the wrong sign",
             _changed(recordings, tau=1 - 2 * which),
         )
     for label, which in chosen:
         for unit, factor in _FACTORS.items():
             scale = 1 + (factor - 1) * which
             yield (
-                f"the position of {label} looks as if it were {unit}",
+                f"the position of {label} seems to be {unit}",
                 _changed(recordings, q=scale),
             )
     for i, j in itertools.combinations(range(n), 2):
@@ -107,7 +107,7 @@ def _mistakes(recordings: Recordings) -> Iterator[tuple[str, Recordings]]:
         order[[i, j]] = j, i
         swapped = [dataclasses.replace(r, tau=r.tau[:, order]) for r in recordings]
         yield (
-            f"the torques of joints {i + 1} and {j + 1} look as if they were swapped",
+            f"the torques of joints {i + 1} and {j + 1} seem to be swapped",
             Recordings.of(swapped),
         )
 

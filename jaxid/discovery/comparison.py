@@ -61,8 +61,8 @@ class Comparison(AbstractShown):
     def judged(self, recording: int | str = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Time, measured and simulated signal as they are compared, `(samples, joints)`.
 
-        If the controller is an assumed one, both signals are low-pass filtered and their ends
-        are removed. They are zero while a joint stands still.
+        If the control law is unknown, both signals are low-passed and their ends are removed. They
+        are zero while a joint is at rest.
 
         **Arguments:**
 
@@ -81,7 +81,7 @@ class Comparison(AbstractShown):
         return record.time[rows], measured, simulated
 
     def shown(self, recording: int | str = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `judged`, for a figure: NaN while a joint stands still and nothing is compared.
+        """As `judged`, for a figure: NaN while a joint is at rest and is not compared.
 
         **Arguments:**
 
@@ -213,7 +213,7 @@ def compare(
         if not np.isfinite(run.tau).all() or not np.isfinite(run.q).all():
             raise FitError(
                 f"the loop {loop.name} diverges when it is simulated along {recording.name} "
-                f"({reason(run.result)}): fit it first, start from other values, or take smaller "
+                f"({reason(run.result)}): fit it first, start from other values, or use smaller "
                 "steps (jaxid.Stepping(substeps=...))"
             )
     return Comparison(
@@ -230,7 +230,7 @@ def _simulate_in_windows(
         return by_recording(simulate_batch(loop, batch), recordings)
     runs = []
     for recording in recordings:
-        # Windows keep the recording's name, since effects of named recordings depend on it.
+        # Windows keep the recording's name, because effects on named recordings need it.
         pieces = pieces_of(Recordings.of(recording), window)
         stepped = with_substeps(loop, Recordings.of(recording))
         parts = by_recording(simulate_batch(stepped, prepare(stepped, pieces)), pieces)

@@ -63,7 +63,7 @@ class Diagnosis(AbstractShown):
     - `pair`: two entries that together explain more than the best curve, if no single one does.
     - `noise`: the noise filter of each output.
     - `floor`: relative error that a model with every effect and curve that matters leaves, %.
-    - `measured`: the noise floor from the recordings alone, where they determine it.
+    - `measured`: the noise floor from the recordings alone, if they determine it.
     - `unexplained`: improvement of the score of the model of `floor` over that of the fit.
     """
 
@@ -104,7 +104,7 @@ class Diagnosis(AbstractShown):
     def light(self) -> "Diagnosis":
         """The same with only the signatures of the ranking, to save memory.
 
-        For curves, only the products of the first few are kept, since only these are drawn.
+        For curves, only the products of the first few are kept, because only these are drawn.
         """
         ranked = sorted({c for v in self.ranking for c in v.hypothesis.columns})
         told = (*self.ranking, *self.forms, *self.pair, *self.where[:_CURVES])
@@ -132,7 +132,7 @@ class Diagnosis(AbstractShown):
         return over_recordings(self.fit.error_percent.to_numpy() * share)
 
     def correlation(self, one: Verdict, other: Verdict) -> float:
-        """Largest correlation of two effects' signatures, without what the model absorbs."""
+        """Largest correlation of two effects' signatures after projection of the model."""
         return self.gram.correlation(one.hypothesis.columns, other.hypothesis.columns)
 
     def alike(self, verdict: Verdict, within: float = 10.0) -> tuple[Verdict, ...]:
@@ -220,7 +220,7 @@ class Diagnosis(AbstractShown):
         **Arguments:**
 
         - `recording`: number from 0; the number of the piece if the fit was in windows.
-        - `joint`: counted from 1. `contenders`: how many to draw.
+        - `joint`: counted from 1. `contenders`: number of contenders to draw.
         """
         from ..display import figures
 
@@ -264,13 +264,13 @@ class Diagnosis(AbstractShown):
         )
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Writes the diagnosis to one file, from which `jaxid.load` gives it back.
+        """Writes the diagnosis to one file, which `jaxid.load` reads.
 
         **Arguments:**
 
-        - `path`: by convention with the ending `.jaxid`; a file that is there is replaced.
+        - `path`: by convention with the ending `.jaxid`; an existing file is replaced.
 
-        **Raises:** `SaveError` where it cannot be written.
+        **Raises:** `SaveError` if it cannot be written.
         """
         return save(self, path)
 
@@ -310,8 +310,8 @@ class Diagnosis(AbstractShown):
     def floor_percent(self) -> Float[np.ndarray, " joints"]:
         """Relative error that a perfect model would leave on the fitted recordings, %.
 
-        Estimated from the recordings alone where they determine it, otherwise by a model with every
-        effect and curve that matters.
+        It is estimated from the recordings alone if they determine it, otherwise by a model with
+        every effect and curve that matters.
         """
         if self.measured is None:
             return over_recordings(self.floor)

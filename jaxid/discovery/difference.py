@@ -93,7 +93,7 @@ class ModelDifference(AbstractShown):
         values = np.array([c.value for c in self.errors])
         half = np.array([_WIDE * c.std for c in self.errors])
         joints = list(self.first.error_percent.columns)
-        name = f"error of {self.names[0]} less that of {self.names[1]}"
+        name = f"error of {self.names[0]} minus that of {self.names[1]}"
         return figures.differences(joints, values, half, x_name=name, x_unit="%")
 
     def to_dict(self) -> dict[str, Any]:
@@ -122,11 +122,11 @@ class ModelDifference(AbstractShown):
         lines = [f"first: {self.names[0]}", f"second: {self.names[1]}"]
         if self.score is not None:
             low, high = self.score.interval
-            verdict = "not told apart"
+            verdict = "not distinguished"
             if self.score.sure:
                 verdict = f"the {'first' if self.score.value < 0 else 'second'} is better"
             lines.append(
-                f"score, first less second: {self.score.value:.1f} ({low:.1f} to {high:.1f}): "
+                f"score, first minus second: {self.score.value:.1f} ({low:.1f} to {high:.1f}): "
                 f"{verdict}"
             )
         lines.append(f"on {', '.join(self.first.recordings.names)}, with 95 % intervals:")
@@ -161,16 +161,16 @@ def compare_models(
     if recordings is None:
         if shared is None:
             raise RecordingError(
-                "these two models were not fitted to the same recordings: give the recordings to "
-                "compare them on, compare_models(first, second, recordings)"
+                "these two models were not fitted to the same recordings: give recordings for the "
+                "comparison, compare_models(first, second, recordings)"
             )
         recordings = shared[0].recordings
     recordings = Recordings.of(recordings)
     one, other = (compare(m, recordings, window=window) for m in (first, second))
     if one.signal != other.signal or _sizes(one.residuals) != _sizes(other.residuals):
         raise ModelError(
-            f"{one.loop.name} and {other.loop.name} are not compared at the same samples of the "
-            "same signal: give both the same controller"
+            f"{one.loop.name} and {other.loop.name} do not predict the same samples of the same "
+            "signal: give both the same controller"
         )
     score = None if shared is None else _score_change(*shared)
     names = _names(one.loop, other.loop)
@@ -219,7 +219,7 @@ def _score_change(first: Fit, second: Fit) -> Change:
 
 def _error_changes(one: Comparison, other: Comparison) -> tuple[Change, ...]:
     left = [np.stack([np.linalg.norm(r, axis=0) for r in x.residuals]) for x in (one, other)]
-    # Taken from the model with the larger residual, since a zero residual gives no scale.
+    # From the model with the larger residual, because a zero residual gives no scale.
     larger = one if left[0].sum() > left[1].sum() else other
     scale = larger.error_percent.to_numpy() / np.maximum(left[larger is other], 1e-300)
 
@@ -252,7 +252,7 @@ def changes(
     better = int(power[1] < power[0])
     near = rows[better]
     apart = [b - a for a, b in zip(near, rows[1 - better], strict=True)]
-    # Rows at which a joint stands still are zero and must remain zero.
+    # Rows at which a joint is at rest are zero and must remain zero.
     there = [(a != 0) | (b != 0) for a, b in zip(*rows, strict=True)]
     noise = noise_filters(near)
     strengths = levels([innovations(r, noise) for r in near])

@@ -1,4 +1,4 @@
-"""An effect's own curve: its torque over what it depends on, with its band, over the residual."""
+"""The curve of an effect: its torque over a coordinate, with its band, over the residual."""
 
 import dataclasses
 import html
@@ -26,27 +26,27 @@ if TYPE_CHECKING:
     import pandas as pd
     import plotly.graph_objects as go
 
-# Share of the torque from which the curve is all that there is to it, and is drawn finely.
+# Share of the torque above which the curve represents the effect completely, and is drawn finely.
 _ALL = 0.98
-# A coordinate further down the list must show so much more of the torque.
+# A coordinate later in the list must explain this additional share of the torque.
 _MORE = 0.01
-# Share that some other coordinate must show, for time not to be asked.
+# Time is not considered if another coordinate explains more than this share.
 _HALF = 0.5
 _COARSE, _FINE = 30, 100
 _WIDE = 1.96
 
 
 class EffectCurve(AbstractShown):
-    """An effect's torque over the coordinate that shows most of it, along recordings.
+    """An effect's torque along recordings, over the coordinate that explains most of it.
 
-    - `effect`, `joint`: which effect, and the joint on which its torque is shown.
-    - `coordinate`: in words, with its unit and that of the torque in `units`.
-    - `signed`: whether torque and residual are taken times the sign of the joint's velocity.
-    - `share`: how much of the power of the effect's torque the curve shows, 0 to 1.
+    - `effect`, `joint`: the effect, and the joint of the torque.
+    - `coordinate`: in words; `units` has its unit and that of the torque.
+    - `signed`: whether torque and residual are multiplied by the sign of the joint's velocity.
+    - `share`: share of the power of the effect's torque that the curve explains, 0 to 1.
     - `x`, `torque`, `std`: the curve and its standard deviation, from the fit's covariance; not
-      finite where the recordings do not determine the effect.
-    - `cloud_x`, `cloud`: the residual of the model without the effect, its other values as they
-      are; None where the effect acts on what the sensor reads, or no torque is compared.
+      finite if the recordings do not determine the effect.
+    - `cloud_x`, `cloud`: the residual of the model without the effect, at unchanged other values;
+      None if the effect acts on a sensor's reading, or no torque is compared.
     """
 
     effect: AbstractEffect
@@ -116,7 +116,7 @@ class EffectCurve(AbstractShown):
         return f"<p>{html.escape(self._head())}</p>{table}"
 
     def _rows(self) -> "pd.DataFrame":
-        """As many rows as fit a screen; the table has all of them."""
+        """Rows that fit on a screen; the table has all rows."""
         return self.table().iloc[:: max(1, len(self.x) // 20)]
 
     def _digits(self) -> Callable[[float], str]:
@@ -137,20 +137,20 @@ def effect_curve(
     joint: int | None = None,
     recordings: Recording | Recordings | Iterable[Recording] | None = None,
 ) -> EffectCurve:
-    """An effect's torque over the coordinate that shows most of it, with its 95 % band.
+    """An effect's torque over the coordinate that explains most of it, with its 95 % band.
 
-    The coordinate is position, velocity, drive torque or acceleration of a joint, or time. Where
-    the torque depends on several, the curve is its mean along the recordings.
+    The coordinate is position, velocity, drive torque or acceleration of a joint, or time. If the
+    torque depends on several coordinates, the curve is its mean along the recordings.
 
     **Arguments:**
 
-    - `fit`: of a loop that has the effect.
+    - `fit`: fit of a loop with the effect.
     - `effect`: its name as in tables, or the effect itself, one of `fit.loop.effects`.
-    - `joint`: on which it is, counted from 1; of an effect on all joints, the one to show.
-    - `recordings`: along which; those of the fit by default.
+    - `joint`: joint of the effect, counted from 1; for an effect on all joints, the one to show.
+    - `recordings`: by default those of the fit.
 
-    **Raises:** `ModelError` where the loop does not have the effect, or it lies between drive and
-    link and has no torque of its own; `FitError` where the loop cannot be simulated.
+    **Raises:** `ModelError` if the loop does not have the effect, or the effect is a transmission,
+    which has no torque of its own; `FitError` if the loop cannot be simulated.
     """
     place = _place(fit.loop, effect, joint)
     chosen = fit.loop.effects[place]
@@ -176,9 +176,9 @@ def effect_curve(
 
 
 def _place(loop: ClosedLoop, effect: str | AbstractEffect, joint: int | None) -> int:
-    """Where an effect stands among those of a loop.
+    """The place of an effect among those of a loop.
 
-    **Raises:** `ModelError` where it does not, or has no torque of its own.
+    **Raises:** `ModelError` if it is not there, or has no torque of its own.
     """
     for k, e in enumerate(loop.effects):
         if isinstance(effect, str):
@@ -188,8 +188,8 @@ def _place(loop: ClosedLoop, effect: str | AbstractEffect, joint: int | None) ->
             found = e is effect
         if found and isinstance(e, AbstractTransmission):
             raise ModelError(
-                f"{e.effect_name()} lies between drive and link and has no torque of its own to "
-                "draw: see what it changes by jaxid.compare_models"
+                f"{e.effect_name()} is a transmission, which has no torque of its own: compare the "
+                "models with and without it by jaxid.compare_models"
             )
         if found:
             return k
@@ -199,8 +199,8 @@ def _place(loop: ClosedLoop, effect: str | AbstractEffect, joint: int | None) ->
 
 
 def _motion(run: Comparison, effect: AbstractEffect) -> tuple[Motion, np.ndarray]:
-    """The motion of the runs, padded to the longest, and which samples are there."""
-    # What acts on the command is given the torque that it acts on, not what it made of it.
+    """The motion of the runs, padded to the longest, and the mask of samples."""
+    # An effect on the command needs the torque before the effect, not after it.
     commands = type(effect).command is not AbstractEffect.command
     longest = max(r.samples for r in run.recordings)
 
@@ -212,7 +212,7 @@ def _motion(run: Comparison, effect: AbstractEffect) -> tuple[Motion, np.ndarray
         return jnp.asarray(np.stack([padded(x) for x in rows]))
 
     runs = run.runs
-    # Made of single instants, whose shapes a motion declares.
+    # Nested vmaps, because `Motion` declares the shapes of one instant.
     motion = jax.vmap(jax.vmap(Motion))(
         stacked(x.time for x in runs),
         stacked(x.q for x in runs),
@@ -227,16 +227,16 @@ def _motion(run: Comparison, effect: AbstractEffect) -> tuple[Motion, np.ndarray
 
 
 def _own(loop: ClosedLoop, place: int, motion: Motion) -> tuple[np.ndarray, np.ndarray, bool]:
-    """What an effect asks of each joint along runs, N·m or N, with its slopes by what is free.
+    """Torque that an effect needs of each joint along runs, N·m or N, with its derivatives.
 
-    Of an effect of a sensor: what it adds to the position that is read, rad or m, and True.
+    For an effect of a sensor: its change of the position reading, rad or m, and True.
     """
     effect = loop.effects[place]
     left = left_for_links(_without(loop, place), motion)
     fields = tuple(str(p.place[-1]) for p in _parameters(loop, place))
     push, noise, _ = force_and_slopes(Placed.of(effect, loop.joints), motion, left, fields)
     sensed = type(effect).read is not AbstractEffect.read
-    # A torque that the effect adds to the joint is one that the drive need not give.
+    # The sign changes, because torque that the effect adds to the joint relieves the drive.
     found = np.asarray(noise) if sensed else -np.asarray(push)
     return found[..., 0], found[..., 1:], sensed
 
@@ -250,7 +250,7 @@ def _parameters(loop: ClosedLoop, place: int) -> list[Any]:
 
 
 def _covariance(fit: Fit, place: int) -> Float[np.ndarray, "values values"]:
-    """Of an effect's free values."""
+    """Covariance of an effect's free values."""
     rows, at = [], 0
     for p in fit.loop.free_parameters:
         if p.place[:2] == ("effects", place):
@@ -262,7 +262,7 @@ def _covariance(fit: Fit, place: int) -> Float[np.ndarray, "values values"]:
 def _coordinate(
     effect: AbstractEffect, value: np.ndarray, motion: Motion, mask: np.ndarray, joint: int
 ) -> tuple[Curve, float]:
-    """The coordinate that shows most of a torque, and the share that it shows."""
+    """The coordinate that explains most of a torque, and the share that it explains."""
     joints = [joint, *(j for j in range(1, motion.q.shape[-1] + 1) if j != joint)]
     names = [(c, j) for j in joints for c in ("v", "q", "tau", "a")]
     found = [
@@ -278,7 +278,7 @@ def _coordinate(
     for over in found:
         y = (value * sign if over.signed else value)[mask]
         along = _along(motion, over)[mask]
-        # Of neighbours on the coordinate that it depends on, a torque differs little (von Neumann).
+        # If torque depends on a coordinate, it differs little between neighbours (von Neumann).
         step = np.diff(y[np.argsort(along, kind="stable")])
         total = float(y @ y)
         shown = 1.0 if total == 0 else max(0.0, 1 - float(step @ step) / (2 * total))
@@ -302,11 +302,11 @@ def _curve(
     slopes: Float[np.ndarray, "samples values"],
     share: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means in stretches of the coordinate: place, torque and slopes, ascending."""
+    """Means in bins of the coordinate: position, torque and derivatives, ascending."""
     count = _FINE if share > _ALL else _COARSE
     edges = np.quantile(x, np.linspace(0, 1, count + 1)[1:-1])
     if share > _ALL:
-        # Where the motion seldom is, stretches of equal count are too long to show the curve.
+        # Bins of equal count alone would be too wide where there are few samples.
         edges = np.union1d(edges, np.linspace(x.min(), x.max(), count + 1)[1:-1])
     _, part = np.unique(np.searchsorted(edges, x), return_inverse=True)
     size = np.bincount(part)
@@ -319,7 +319,7 @@ def _curve(
 def _cloud(
     fit: Fit, place: int, run: Comparison, along: np.ndarray, sign: np.ndarray, joint: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The residual of the model without an effect, and where on the coordinate each sample is."""
+    """The residual of the model without an effect, and the coordinate of each sample."""
     without = dataclasses.replace(fit, loop=_without(fit.loop, place))
     left = compare(without, run.recordings)
     x, y = [], []

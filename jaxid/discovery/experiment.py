@@ -1,4 +1,4 @@
-"""What to record next, so that effects which look alike can be told apart."""
+"""What to record next to distinguish effects that look alike."""
 
 import dataclasses
 import html
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 class Experiment(AbstractShown):
     """A reference to record next.
 
-    - `recording`: its `time` and `q_ref`; `q` and `tau` are what the model expects.
-    - `now`, `then`: whitened squared error by which the effects differ, on the recordings at hand
+    - `recording`: its `time` and `q_ref`; `q` and `tau` are predictions of the model.
+    - `now`, `then`: whitened squared error by which the effects differ, on the present recordings
       and on the proposed one; ten is decisive.
-    - `units`: of torque and of position, one a joint each.
+    - `units`: units of torque and of position, one for each joint.
     """
 
     recording: Recording
@@ -75,9 +75,9 @@ class Experiment(AbstractShown):
 
     def __repr__(self) -> str:
         return (
-            f"a reference of {self.recording.duration:.0f} s that sets "
-            f"{' and '.join(self.effects)} apart by {self.then:.3g} in whitened squared error; "
-            f"the recordings at hand do by {self.now:.3g} (ten is decisive)"
+            f"a reference of {self.recording.duration:.0f} s that distinguishes "
+            f"{' and '.join(self.effects)} by {self.then:.3g} in whitened squared error; the "
+            f"present recordings do by {self.now:.3g} (ten is decisive)"
         )
 
 
@@ -92,32 +92,32 @@ def next_experiment(
 ) -> Experiment:
     """Proposes a reference on which effects that look alike differ most.
 
-    Multi-sines are drawn, scaled into the limits and simulated; the best is returned.
+    Random multi-sines are scaled to the limits and simulated; the best one is returned.
 
     **Arguments:**
 
-    - `effects`: two or more entries of the ranking; by default the leader and what looks like it.
-      One alone asks for the reference that determines its amplitude best.
-    - `limits`: by default what the recordings at hand have reached.
-    - `duration`: s. `tries`: how many references are drawn.
+    - `effects`: two or more entries of the ranking; by default the leader and its look-alikes. For
+      a single effect, the reference is the one that determines its amplitude best.
+    - `limits`: by default those that the present recordings have reached.
+    - `duration`: s. `tries`: number of random references.
 
-    **Raises:** `FitError` where nothing can be compared, no reference keeps within the limits, or
-    the loop follows none.
+    **Raises:** `FitError` if there is nothing to compare, no reference is within the limits, or the
+    loop cannot follow a reference.
     """
     if isinstance(diagnosis.fit.loop.controller, OpenLoop):
         raise FitError(
-            "recorded torque drives this loop, so it follows no reference that could be proposed: "
-            "give the loop its controller"
+            "the recorded torque drives this loop, so it cannot follow a reference: give the loop "
+            "its controller"
         )
     chosen = list(effects) if effects is not None else _group(diagnosis)
-    # A transmission's signature is a simulation of its own, too slow to repeat for each reference.
+    # Signatures of transmissions need simulations, too slow to repeat for each reference.
     asked, parted = chosen, [isinstance(v.hypothesis.effect, AbstractTransmission) for v in chosen]
     chosen = [v for v, apart in zip(asked, parted, strict=True) if not apart]
     if any(parted) and len(chosen) < min(len(asked), 2):
         first = asked[parted.index(True)]
         raise FitError(
-            f"the signature of {effect_on(*first.key)} is a simulation of its own, too slow to "
-            "repeat for each reference: give two effects that are no transmissions"
+            f"the signature of {effect_on(*first.key)} needs simulations, too slow to repeat for "
+            "each reference: give two effects that are not transmissions"
         )
     bounds = Limits.of(diagnosis.fit.recordings) if limits is None else limits
     loop = with_substeps(diagnosis.fit.loop, diagnosis.fit.recordings)
@@ -128,7 +128,7 @@ def next_experiment(
     scores, runs = _separations(loop, drawn, chosen, diagnosis, bounds)
     if not np.isfinite(scores).any():
         raise FitError(
-            "none of the references drawn keeps the motion within the limits of torque: raise "
+            "none of the random references keeps the torque within its limits: raise "
             "limits.torque, or lower limits.speed"
         )
     best = int(np.nanargmax(np.where(np.isfinite(scores), scores, np.nan)))
@@ -136,7 +136,7 @@ def next_experiment(
     numbers = [list(v.hypothesis.columns) for v in chosen]
     sizes = [diagnosis.gram.amplitude(c)[0] for c in numbers]
     flat = [c for columns in numbers for c in columns]
-    # The products of these alone, which count from nothing.
+    # Only the products of these effects, with columns counted from zero.
     at_hand = dataclasses.replace(diagnosis.gram.only(flat), kept=None)
     columns = [[flat.index(c) for c in own] for own in numbers]
     now = _apart(at_hand, columns, sizes)
@@ -151,13 +151,13 @@ def next_experiment(
 
 def _group(diagnosis: Diagnosis) -> list[Verdict]:
     if not diagnosis.ranking:
-        raise FitError("nothing was screened, so there is nothing to tell apart")
+        raise FitError("nothing was screened, so there are no effects to distinguish")
     leader = diagnosis.ranking[0]
     return [leader, *diagnosis.alike(leader, within=30.0)][:3]
 
 
 def _draw(limits: Limits, duration: float, period: float, rng: np.random.Generator) -> Recording:
-    """A multi-sine from rest, as large as the limits let it be."""
+    """A random multi-sine from rest, as large as the limits allow."""
     time = np.arange(round(duration / period) + 1) * period
     ramp = np.clip(time / min(2.0, duration / 5), 0, 1)
     ramp = ramp**3 * (10 - 15 * ramp + 6 * ramp**2)
@@ -177,7 +177,7 @@ def _draw(limits: Limits, duration: float, period: float, rng: np.random.Generat
             limits.acceleration[j] / max(np.abs(a).max(), 1e-12),
         )
         x = scale * x
-        # Somewhere within the limits, since what an effect shows may depend on where.
+        # At a random place within the limits, because a signature may depend on it.
         low, high = limits.low[j] - x.min(), limits.high[j] - x.max()
         columns.append(x + rng.uniform(min(low, high), max(low, high)))
     q_ref = np.stack(columns, axis=1)
@@ -191,7 +191,7 @@ def _separations(
     diagnosis: Diagnosis,
     limits: Limits,
 ) -> tuple[Float[np.ndarray, " tries"], list[Recording]]:
-    """How far apart the effects are on each reference; not a number where a limit is passed."""
+    """How much the effects differ on each reference; NaN if a limit is exceeded."""
     batch = prepare(loop, drawn)
     linear = linearise(loop, batch, "tau")
     proposed = [(v.hypothesis.effect, 1.0) for v in chosen]
@@ -219,10 +219,10 @@ def _separations(
 
 
 def _apart(gram: Gram, columns: Sequence[Sequence[int]], amplitudes: Sequence[np.ndarray]) -> float:
-    """How decisively the first effect and the nearest other differ, whichever of them is true.
+    """Whitened squared error between the first effect and the nearest other effect.
 
-    What is left of one, at its amplitude, that the other cannot imitate; the larger of both ways,
-    since an effect that is a special case of another is always imitated by it.
+    It is the part of one effect, at its amplitude, that the other cannot imitate. The larger value
+    of both directions counts, because an effect can always imitate its special cases.
     """
 
     def left(one: int, other: Sequence[int]) -> float:

@@ -1,4 +1,4 @@
-"""Many robots at once: a discovery for each, and a table in which the odd one stands out."""
+"""Discoveries for many robots, with one table for comparison."""
 
 import os
 from collections.abc import Mapping
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 
 class FleetRobot(eqx.Module):
-    """One robot of a fleet: its model, its recordings, and those that judge.
+    """One robot of a fleet: its model, its recordings, and held-out recordings.
 
-    - `settings`: of its discovery, in place of those of all.
+    - `settings`: settings of its discovery, instead of those for all robots.
     """
 
     loop: ClosedLoop
@@ -34,10 +34,10 @@ class FleetRobot(eqx.Module):
 
 
 class Fleet(eqx.Module):
-    """What was found on each robot.
+    """The results of all robots.
 
-    - `stories`: by robot, what `Discovery.to_dict` gives.
-    - `failed`: by robot, why nothing was found.
+    - `stories`: result of `Discovery.to_dict` by robot.
+    - `failed`: reason of a failure by robot.
     """
 
     stories: dict[str, dict[str, Any]] = eqx.field(static=True)
@@ -87,23 +87,22 @@ def discover_all(
     progress: bool = True,
     **settings: Any,
 ) -> Fleet:
-    """A discovery for each of many robots; one that fails stops none of the others.
+    """Runs a discovery for each of many robots; a failure does not stop the others.
 
     **Arguments:**
 
-    - `problems`: by the robot's name.
-    - `executor`: any of `concurrent.futures`, Dask's `client.get_executor()` and mpi4py's among
-      them; processes of this machine where None.
-    - `jobs`: how many of these; one for each core by default.
-    - `resume`: a folder in which each robot's result is kept as it ends, and from which the same
-      call continues.
-    - `settings`: of each discovery, as for `discover`.
+    - `problems`: robots by name.
+    - `executor`: any executor of `concurrent.futures`, including Dask's `client.get_executor()` and
+      that of mpi4py; processes of this machine if None.
+    - `jobs`: number of processes; by default one for each core.
+    - `resume`: a folder in which each robot's result is saved when it finishes; the same call
+      continues from it.
+    - `settings`: settings of each discovery, as for `discover`.
 
-    **Raises:** `ModelError` where there is nothing to do; `SaveError` where the folder holds other
-    work.
+    **Raises:** `ModelError` if there is no robot; `SaveError` if the folder contains other work.
     """
     if not problems:
-        raise ModelError("there is no robot to look at: give at least one problem")
+        raise ModelError("no robot is given: give at least one problem")
     plan = {"problems": dict(problems), "settings": settings}
     work = {name: (problem, settings) for name, problem in problems.items()}
     classes = {c for problem in problems.values() for c in classes_of(problem)}
@@ -128,7 +127,7 @@ def _solved(given: tuple[FleetRobot, dict[str, Any]]) -> dict[str, Any]:
     chosen = {**settings, **problem.settings, "progress": False}
     story = discover(problem.loop, problem.recordings, problem.validate, **chosen)
     if story.interrupted:
-        # Of a robot that was not done nothing is kept, and no other one is begun.
+        # An interrupted robot is not saved, and no other robot is started.
         raise KeyboardInterrupt
     return story.to_dict()
 

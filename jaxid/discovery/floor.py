@@ -1,4 +1,4 @@
-"""The noise floor of a fit from its recordings alone: what no model of the robot can explain."""
+"""The noise floor of a fit from its recordings alone: the part that no model can explain."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from ..signals.smoothing import signal_cutoff
 from ..simulation.batch import band_of, compared
 from ..simulation.loop import ClosedLoop
 
-# What each source is called in a sentence.
+# The sources in words.
 SPOKEN = {
     "repeats": "from recordings that repeat a reference",
     "above the motion": "from the torque above the motion's frequencies",
@@ -22,11 +22,11 @@ SPOKEN = {
 
 
 class Floor(eqx.Module):
-    """Relative error by recording and joint that the noise of the recorded torque leaves, %.
+    """Relative error by recording and joint due to the noise of the recorded torque, %.
 
-    - `percent`, `low`, `high`: its estimate and 95 % interval; not a number where the recordings do
-      not tell it.
-    - `sources`: by recording and joint, "repeats" or "above the motion"; empty where not told.
+    - `percent`, `low`, `high`: its estimate and 95 % interval; NaN if the recordings do not
+      determine it.
+    - `sources`: by recording and joint, "repeats" or "above the motion"; empty if not determined.
     """
 
     percent: Float[np.ndarray, "recordings joints"]
@@ -36,13 +36,13 @@ class Floor(eqx.Module):
 
 
 def floor_of(loop: ClosedLoop, recordings: Recordings) -> Floor | None:
-    """The noise floor of what is compared, from repeats of a reference or above the motion.
+    """The noise floor of compared signals, from repeats of a reference or above the motion.
 
-    None where positions are compared.
+    None if positions are compared.
 
     **Arguments:**
 
-    - `loop`: its controller says what is compared; its model does not enter.
+    - `loop`: its controller determines the compared signals; its model is not used.
     """
     if loop.controller.judged == "position":
         return None
@@ -62,7 +62,7 @@ def floor_of(loop: ClosedLoop, recordings: Recordings) -> Floor | None:
 
 
 def _relative(levels: Sequence[tuple[Level | None, ...]], torque: Sequence[np.ndarray]) -> Floor:
-    """Levels over the size of the torque that is compared; its rows are zero where none is."""
+    """Levels over the size of the compared torque; rows that are not compared are zero."""
     shape = len(levels), len(levels[0])
     numbers = np.full((3, *shape), np.nan)
     for k, (row, tau) in enumerate(zip(levels, torque, strict=True)):

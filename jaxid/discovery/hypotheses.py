@@ -1,4 +1,4 @@
-"""Hypotheses: which effects, at which settings, may be missing."""
+"""Hypotheses: effects and settings that may be missing."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,8 +23,8 @@ from ..simulation.loop import ClosedLoop
 class Hypothesis(eqx.Module):
     """One effect at one setting, with its columns in the table of signatures.
 
-    `lower` and `upper` bound the amplitudes; `tests` counts how many settings it stands for, where
-    it was picked from many by the data.
+    `lower` and `upper` bound the amplitudes; `tests` is the number of settings from which the data
+    selected this one.
     """
 
     effect: AbstractEffect
@@ -45,7 +45,7 @@ class Hypothesis(eqx.Module):
 
 
 def amplitudes(effect: AbstractEffect) -> tuple[Parameter, ...]:
-    """The parameters in which the effect is linear; none where it is screened by simulations."""
+    """The parameters in which the effect is linear; none if it is screened by simulations."""
     if effect.finite:
         return ()
     return tuple(p for p in free_of(effect) if p.declaration.linear)
@@ -57,12 +57,12 @@ def free_of(effect: AbstractEffect) -> tuple[Parameter, ...]:
 
 
 def effect_on(name: str, joint: int | None) -> str:
-    """An effect's name and its joint, if it has one, as a sentence has them."""
+    """An effect's name and its joint, if it has one, in words."""
     return name + ("" if joint is None else f" on joint {joint}")
 
 
 def on_recordings(effect: AbstractEffect) -> str:
-    """The recordings that an effect is on, as a sentence goes on; nothing where it is on all."""
+    """The recordings that have an effect, as part of a sentence; empty if all have it."""
     named = getattr(effect, "recordings", ())
     return f" in {' and '.join(named)}" if named else ""
 
@@ -73,19 +73,19 @@ def survey(
     motion: Motion,
     tones: Sequence[Sequence[float]],
 ) -> Scene:
-    """What screening knows of the recordings and the nominal motion."""
+    """Properties of the recordings and the nominal motion that screening uses."""
     q = np.asarray(motion.q).reshape(-1, loop.joints)
     low, high = q.min(axis=0), q.max(axis=0)
     speed = np.abs(np.asarray(motion.v)).reshape(-1, loop.joints).max(axis=0)
     # Always so many positions, for one program.
     chosen = np.linspace(0, len(q) - 1, _POSITIONS).astype(int)
     mass = np.asarray(_mass_matrices(loop.arm, q[chosen]))
-    # Rotors are effects: without them drawn bodies may leave a wrist next to none.
+    # Rotors are effects: without them a wrist with drawn bodies may have almost no inertia.
     mass = mass + 1e-6 * np.trace(mass, axis1=1, axis2=2)[:, None, None] * np.eye(loop.joints)
     smoothed = {e.joint: float(e.smoothing) for e in loop.effects if isinstance(e, Coulomb)}
     return Scene(
         low,
-        # A joint that is held still has a travel all the same, which shapes can be a part of.
+        # A joint at rest gets a small travel, because shapes are shares of it.
         np.maximum(high, low + 1e-6),
         np.maximum(speed, 1e-6),
         np.abs(np.asarray(motion.tau)).reshape(-1, loop.joints).max(axis=0),
@@ -146,12 +146,12 @@ def curves(scene: Scene, motion: Motion, knots: int = 12) -> list[Curve]:
 def candidates(
     catalogue: Sequence[Any], scene: Scene, trials: float
 ) -> list[tuple[AbstractEffect, float]]:
-    """Every instance that a catalogue proposes, with how many settings it stands for.
+    """Every instance that a catalogue proposes, with the number of settings that it represents.
 
     **Arguments:**
 
     - `catalogue`: effect classes, effects, or functions from a `Scene` to effects.
-    - `trials`: how many frequencies the tones of the scene were picked from.
+    - `trials`: number of frequencies from which the tones of the scene were selected.
 
     **Raises:** `ModelError` for an entry that is none of these.
     """
@@ -166,8 +166,8 @@ def candidates(
             made.extend([given] if isinstance(given, AbstractEffect) else list(given))
         else:
             raise ModelError(
-                f"{entry!r} cannot be screened: a catalogue holds effect classes, effects, or "
-                "functions from a scene to effects"
+                f"{entry!r} cannot be screened: a catalogue consists of effect classes, effects, "
+                "or functions from a scene to effects"
             )
     for one in {type(e): e for e in made if type(e) not in known}.values():
         check_declared(one, len(scene.slides))

@@ -1,4 +1,4 @@
-"""Every hypothesis held against what a set of effects leaves in the linear system."""
+"""All hypotheses compared with the residual of a set of effects in the linear system."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ from .system import System
 
 
 class Entry(eqx.Module):
-    """A hypothesis beside a set of effects: what more it would explain, less its price."""
+    """A hypothesis in addition to a set of effects: what it would explain, minus its price."""
 
     hypothesis: Hypothesis
     evidence: float
@@ -24,7 +24,7 @@ class Entry(eqx.Module):
 
 
 class Landscape(eqx.Module):
-    """The table of signatures as noise lets it be seen, with the system that they are of."""
+    """The whitened table of signatures, with its linear system."""
 
     predictor: Predictor
     data: Data
@@ -36,11 +36,11 @@ class Landscape(eqx.Module):
     def of(
         cls, system: System, data: Data, hypotheses: Sequence[Hypothesis], noise: Sequence[ARFilter]
     ) -> "Landscape":
-        """Of signatures, through noise filters.
+        """A landscape from signatures and noise filters.
 
         **Arguments:**
 
-        - `data`: with the signatures in its table, and the level of noise in each recording.
+        - `data`: has the signatures in its table, and the noise level of each recording.
         """
         predictor = Predictor.of(system, noise, data.level)
         white = Whitened.of(data, noise)
@@ -48,20 +48,20 @@ class Landscape(eqx.Module):
 
     @property
     def forms(self) -> int:
-        """How many effects there are to choose from."""
+        """Number of effects to choose from."""
         return forms_of(self.hypotheses)
 
     def beside(self, set_: Prediction | None, most: int = 12, curves: bool = False) -> list[Entry]:
-        """The best setting of each form of effect beside a set, best first.
+        """The best setting of each form of effect in addition to a set, best first.
 
         **Arguments:**
 
-        - `most`: how many forms. `curves`: free-form curves in place of effects.
+        - `most`: number of forms. `curves`: free-form curves instead of effects.
         """
         return self._entries(*self._left(set_), most, curves)
 
     def pairs(self, set_: Prediction | None, firsts: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
-        """For each of some entries the one that explains most beside it and the set."""
+        """For each given entry, the entry that explains most in addition to it and the set."""
         residual, taken = self._left(set_)
         made = []
         for first in firsts:
@@ -79,7 +79,7 @@ class Landscape(eqx.Module):
         return sorted(made, key=lambda pair: -(pair[0].evidence + pair[1].evidence))
 
     def _left(self, set_: Prediction | None) -> tuple[np.ndarray, np.ndarray]:
-        """What a set leaves of the whitened residual, and directions that it can absorb."""
+        """The whitened residual of a set, and directions that the set can absorb."""
         if set_ is None or not set_.effects:
             return self.white.residual, np.zeros((len(self.white.residual), 0))
         return set_.residual, spanned(set_.slopes)
@@ -121,12 +121,12 @@ class Landscape(eqx.Module):
 
 
 def forms_of(hypotheses: Sequence[Hypothesis]) -> int:
-    """How many effects there are to choose from, forms and joints counted apart."""
+    """Number of effects to choose from; forms and joints count separately."""
     return len({form(h.effect) for h in hypotheses})
 
 
 def form(effect: AbstractEffect) -> tuple:
-    """What tells one hypothesis from another, but for its setting."""
+    """The identity of a hypothesis without its setting."""
     joint, kind = getattr(effect, "joint", None), type(effect).__name__
     if isinstance(effect, Curve):
         return effect.effect_name(), joint, (effect.label, effect.signed)
@@ -134,7 +134,7 @@ def form(effect: AbstractEffect) -> tuple:
 
 
 def shares_a_joint(effects: Sequence[AbstractEffect]) -> bool:
-    """Whether two transmissions are on one joint, which has room for one."""
+    """Whether two transmissions are on one joint, which can have only one."""
     joints = [e.joint for e in effects if isinstance(e, AbstractTransmission)]
     return len(joints) != len(set(joints))
 

@@ -1,4 +1,4 @@
-"""The loop along a run as a linear time-varying system: linearise once, force many."""
+"""The loop along a run as a linear time-varying system: one linearisation, many inputs."""
 
 import dataclasses
 from typing import Any, Literal
@@ -25,11 +25,12 @@ Place = Literal["push", "noise", "rate", "pull"]
 class Linearised(eqx.Module):
     """Exact derivatives of every interval along the runs of a batch.
 
-    With x' = A x + B u and y = C x + D u, where u holds the free parameters, then each of `places`
-    at both ends of an interval: torque on the drives (`push`), what is added to the positions
-    (`noise`) and velocities (`rate`) that the sensors read, and torque on the links (`pull`) where
-    transmissions or friction by load part them from the drives. Each leaf has `(recordings,
-    points)` first. `motion` is the nominal one, `seen` the signals of `SIGNALS`.
+    The system is x' = A x + B u, y = C x + D u. The input u contains the free parameters, then each
+    of `places` at both ends of an interval: torque on the drives (`push`), additions to the
+    positions (`noise`) and velocities (`rate`) that the sensors read, and torque on the links
+    (`pull`) if transmissions or load-dependent friction separate them from the drives. Each leaf
+    has `(recordings, points)` first. `motion` is the nominal motion, `seen` the signals of
+    `SIGNALS`.
     """
 
     A: Float[Array, "recordings points states states"]
@@ -65,7 +66,7 @@ def _linearised(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     def one(u, interval, x):
         outside = dict(zip(places, u[p:].reshape(-1, 2, n), strict=True))
         forced = dataclasses.replace(interval, **outside)
-        # A failed solve is not finite, and its number not needed.
+        # A failed solve is not finite, so its result number is not needed.
         after, seen, _ = advance(loop.with_theta(u[:p]), forced, x)
         return jnp.concatenate([after, seen[row]])
 
@@ -104,9 +105,9 @@ def _linearised(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
 def base_columns(
     linear: Linearised, parameters: int, free_start: bool
 ) -> Float[Array, "recordings points outputs columns"]:
-    """What the loop's own parameters, and initial states where free, do to the output.
+    """Derivative of the output by the loop's own parameters, and by initial states if free.
 
-    Initial states have one set of columns, to be taken for each recording on its own.
+    Initial states have one set of columns, which applies to each recording separately.
     """
     return one_by_one(lambda one: _base_columns(one, parameters, free_start), linear)
 
@@ -138,12 +139,12 @@ def respond(
     place: Place,
     values: Float[Array | np.ndarray, "recordings points joints columns"],
 ) -> Float[Array, "recordings points outputs columns"]:
-    """What inputs given at the points do to the output through the loop; linear in between.
+    """Response of the output to inputs given at the points, linear in between.
 
     **Arguments:**
 
     - `place`: one of `linear.places`.
-    - `values`: one column a hypothesis: N·m or N; rad or m; rad/s or m/s.
+    - `values`: one column per hypothesis: N·m or N; rad or m; rad/s or m/s.
     """
     return one_by_one(lambda one: _response(one[0], place, one[1]), (linear, values))
 
@@ -159,7 +160,7 @@ def _response(
     inputs = slice(first, first + 2 * joints)
 
     def times(matrix, columns):
-        # Written out, the four products fuse into one loop over the columns.
+        # In this form XLA fuses the four products into one loop over the columns.
         return jnp.sum(matrix[:, :, None] * columns[None], axis=1)
 
     def one(a, b, c, d, start, values):
@@ -172,7 +173,7 @@ def _response(
         after = jnp.concatenate([values[1:], values[-1:]])
         s = jnp.zeros((a.shape[-1], values.shape[-1]), values.dtype)
         if place in ("noise", "rate"):
-            # A run starts where, and as fast as, the sensors said that it does.
+            # A run starts at the position and velocity that the sensors read.
             of = start[:, :joints] if place == "noise" else start[:, joints:]
             s = -times(of.astype(values.dtype), values[0])
         matrices = (x.astype(values.dtype) for x in (a, b[..., inputs], c, d[..., inputs]))
@@ -182,7 +183,7 @@ def _response(
 
 
 def sampled(batch: Batch, tree: Any) -> Any:
-    """Leaves of `(recordings, points, ...)` at the samples alone, of a grid that may be finer."""
+    """Leaves of `(recordings, points, ...)` at the samples; the grid may be finer."""
     if batch.at is None:
         return tree
     rows = np.arange(len(batch.at))[:, None], np.asarray(batch.at)
@@ -190,7 +191,7 @@ def sampled(batch: Batch, tree: Any) -> Any:
 
 
 def at_samples(batch: Batch, x: Float[np.ndarray, "recordings points *axes"]) -> np.ndarray:
-    """Rows at the samples, in the band that is compared, zero where there is no sample."""
+    """Rows at the samples, in the compared band; zero for padding."""
     x = sampled(batch, x)
     mask = np.asarray(batch.mask).reshape(*batch.mask.shape, *(1,) * (x.ndim - 2))
     x = x * mask.astype(x.dtype)
@@ -198,7 +199,7 @@ def at_samples(batch: Batch, x: Float[np.ndarray, "recordings points *axes"]) ->
 
 
 def at_rows(batch: Batch, tree: Any) -> Any:
-    """Leaves of `(recordings, points, ...)` as they are, at the rows that are compared."""
+    """Leaves of `(recordings, points, ...)` without filtering, at the compared rows."""
     if batch.band is None:
         return sampled(batch, tree)
     return jax.tree.map(batch.band.picked, sampled(batch, tree))

@@ -1,4 +1,4 @@
-"""Models that a search has looked at, and what they are worth beside each other."""
+"""Models that a search has examined, with their scores and weights."""
 
 import dataclasses
 from collections import Counter
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Named = tuple[str, int | None]
-# Difference of scores up to which a rival has a weight worth naming: odds of 20 to 1.
+# Models within this difference of scores are indistinguishable: odds of 20 to 1.
 LIKELY = 6.0
-# Models that are kept for a story: what is further down the list has no weight.
+# Number of models that a story keeps; later ones have no weight.
 _KEPT = 30
 
 
 class Model(eqx.Module):
     """A set of effects over the starting model, and its score.
 
-    - `curve`: a free-form curve that it has beside them.
-    - `fit`: its full refit; None where it was predicted only.
-    - `noise`: filters of what it leaves, one an output.
+    - `curve`: a free-form curve in addition to the effects.
+    - `fit`: its full refit; None if it was only predicted.
+    - `noise`: noise filters of its residual, one per output.
     - `left`: relative error on the fitted recordings by joint, %.
-    - `beyond`: how many of its effects, and its curve, were predicted beside a fitted model.
-    - `weight`: its posterior weight among all models that were looked at.
-    - `held_out`: its comparison with recordings that no fit has seen, where one was made.
+    - `beyond`: number of its effects, and its curve, that were predicted from a fitted model.
+    - `weight`: its posterior weight among all examined models.
+    - `held_out`: its comparison with held-out recordings, if there is one.
     """
 
     effects: tuple[AbstractEffect, ...]
@@ -55,7 +55,7 @@ class Model(eqx.Module):
 
     @property
     def key(self) -> tuple:
-        """Which effects are in it."""
+        """Identity of the set of effects."""
         return key_of(self.effects, self.curve)
 
     @property
@@ -65,18 +65,18 @@ class Model(eqx.Module):
 
     @property
     def status(self) -> str:
-        """How its fit ended, or that it was predicted."""
+        """Status of its fit, or `predicted`."""
         return "predicted" if self.fit is None else self.fit.status.name
 
     @property
     def unseen_percent(self) -> Float[np.ndarray, " joints"] | None:
-        """Relative error on recordings that no fit has seen, by joint, %."""
+        """Relative error on held-out recordings, by joint, %."""
         held = self.held_out
         return None if held is None else over_recordings(held.error_percent.to_numpy())
 
     @property
     def label(self) -> str:
-        """What it has over the starting model, in words."""
+        """Its additions to the starting model, in words."""
         parts = [effect_on(*named(e)) for e in self.effects]
         if self.curve is not None:
             along = f"{self.curve.label}{' and direction' if self.curve.signed else ''}"
@@ -110,12 +110,12 @@ def named(effect: AbstractEffect) -> Named:
 
 
 def listed(effects: Sequence[AbstractEffect]) -> str:
-    """Effects with their joints, as a sentence lists them."""
+    """Effects with their joints, as part of a sentence."""
     return " and ".join(effect_on(*named(e)) for e in effects)
 
 
 def piece_name(effects: Sequence[AbstractEffect]) -> str:
-    """The name of a set's refit among saved pieces; forms of one name are told apart."""
+    """The name of a set's refit among saved pieces; it distinguishes forms of one effect."""
     parts = []
     for e in effects:
         name, joint, kind = form(e)
@@ -124,19 +124,19 @@ def piece_name(effects: Sequence[AbstractEffect]) -> str:
 
 
 class Visited:
-    """All models that were looked at, each at its best score: a refit's, else a prediction's."""
+    """All examined models, each with the score of its refit, or else of its best prediction."""
 
     def __init__(self) -> None:
         self._models: dict[tuple, Model] = {}
 
     def add(self, model: Model) -> None:
-        """A model; what is known from nearer to a refit stays."""
+        """Adds a model, unless it is known from a prediction nearer to a refit."""
         had = self._models.get(model.key)
         if had is None or (model.beyond, model.score) < (had.beyond, had.score):
             self._models[model.key] = model
 
     def forget(self, gone: set[tuple]) -> None:
-        """Leaves out all models with an effect of these forms."""
+        """Removes all models with an effect of these forms."""
         self._models = {k: m for k, m in self._models.items() if not gone.intersection(k)}
 
     def add_predicted(
@@ -146,13 +146,13 @@ class Visited:
         anchor: float,
         left: Callable[[Candidate], np.ndarray],
     ) -> None:
-        """Sets predicted beside a fitted model.
+        """Adds sets predicted from a fitted model.
 
         **Arguments:**
 
-        - `anchor`: what is added to their scores, so that the best of them which was refitted has
-          the score of its refit.
-        - `left`: a set's relative error by joint, %.
+        - `anchor`: correction of their scores; with it, the best set that was refitted has the
+          score of its refit.
+        - `left`: function for a set's relative error by joint, %.
         """
         for c in found:
             if np.isfinite(c.score) and (c.effects or c.curve is not None):
@@ -173,7 +173,7 @@ class Visited:
         return sorted(filter(which, self._models.values()), key=lambda m: m.score)
 
     def alike(self, chosen: Model, effect: AbstractEffect) -> tuple[Named, ...]:
-        """What could stand in an effect's place in a model, at nearly the same score."""
+        """Effects that could replace an effect of a model at nearly the same score."""
         rest = list(chosen.effects)
         rest.remove(next(e for e in rest if e is effect))
         kept = sorted((form(e) for e in rest), key=repr)
@@ -192,8 +192,8 @@ class Visited:
     def weighed(self, chosen: Model) -> tuple[Model, ...]:
         """All models with their weights, best first.
 
-        Sets that have all of the chosen one's effects are known from its own linear system; what
-        was predicted of them from further away is out of date.
+        Sets that contain all effects of the chosen model are predicted from its own linear system.
+        Earlier predictions of these sets are left out.
         """
 
         def known(m: Model) -> bool:
@@ -208,19 +208,19 @@ class Visited:
 
 
 def probability(models: Iterable[Model], name: Named) -> float:
-    """Weight of all models that have an effect (Madigan and Raftery 1994)."""
+    """Total weight of all models with an effect (Madigan and Raftery 1994)."""
     return float(sum(m.weight for m in models if name in m.names))
 
 
 def worth_keeping(models: Sequence[Model]) -> tuple[Model, ...]:
-    """The best models and all that were fitted."""
+    """The best models and all fitted ones."""
     return tuple(m for k, m in enumerate(models) if k < _KEPT or m.fit is not None)
 
 
 def picked(models: Sequence[Model], asked: int | str) -> Model:
-    """A model by its row in the table, or by its name there.
+    """A model by its row in the table, or by its name.
 
-    **Raises:** `ModelError` where there is none.
+    **Raises:** `ModelError` if there is no such model.
     """
     found = models if isinstance(asked, int) else [m for m in models if m.label == asked]
     place = asked if isinstance(asked, int) else 0
@@ -234,7 +234,7 @@ def picked(models: Sequence[Model], asked: int | str) -> Model:
 
 
 def models_table(models: Sequence[Model]) -> "pd.DataFrame":
-    """Models beside each other: score, difference to the best, weight, errors in %, status."""
+    """Table of models: score, difference to the best, weight, errors in %, status."""
     import pandas as pd
 
     rows = []

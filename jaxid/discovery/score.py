@@ -1,4 +1,4 @@
-"""Score statistics: what each hypothesis explains of the whitened residual, and by what chance."""
+"""Score statistics: the part of the whitened residual that hypotheses explain, and p-values."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,28 +15,27 @@ Blocks = Sequence[Sequence[int]]
 
 
 def _places(numbers: Sequence[int], kept: tuple[int, ...] | None) -> list[int]:
-    """Where columns are among those that were kept; None where all were.
+    """Places of columns among those that were kept; `kept` is None if all were.
 
-    **Raises:** `FitError` where they have not been kept.
+    **Raises:** `FitError` if they were not kept.
     """
     if kept is None:
         return list(numbers)
     if not set(numbers) <= set(kept):
         raise FitError(
-            "a story keeps the signatures of its rankings alone: jaxid.diagnose(step.fit) has "
-            "all of them"
+            "a story keeps only the signatures of its rankings: use jaxid.diagnose(step.fit) for "
+            "all signatures"
         )
     return [kept.index(number) for number in numbers]
 
 
 class Data(eqx.Module):
-    """Residual and sensitivities at the samples; zero where there is no sample.
+    """Residual and sensitivities at the samples; zero for padding.
 
-    `base` are the columns that the model's own parameters and initial states can absorb, `table`
-    the signatures, `mask` says which samples are there. Signatures are of single precision: they
-    are many, and to be told from noise they need three digits. `level` is how loud noise is in each
-    recording beside the mean of all; None where they are alike. `kept` are the numbers of the
-    columns that are in the table; None where all of them are.
+    `base` has the columns that the model's own parameters and initial states can absorb, `table`
+    the signatures; `mask` is false for padding. Signatures are in single precision: there are many,
+    and three digits suffice. `level` is the noise level of each recording relative to the mean;
+    None if all are equal. `kept` are the numbers of the columns in the table; None for all columns.
     """
 
     residual: Rows
@@ -51,16 +50,16 @@ class Data(eqx.Module):
     ) -> Float[np.ndarray, "recordings samples outputs columns"]:
         """Signatures by their numbers.
 
-        **Raises:** `FitError` where they have not been kept.
+        **Raises:** `FitError` if they have not been kept.
         """
         return self.table[..., _places(numbers, self.kept)]
 
     def only(self, numbers: Sequence[int]) -> "Data":
-        """The same with these columns of the table alone."""
+        """The same with only these columns of the table."""
         return dataclasses.replace(self, table=self.columns(numbers), kept=tuple(numbers))
 
     def series(self, rows: Rows, output: int) -> list[np.ndarray]:
-        """One output's rows, one series a recording, all at the same level of noise."""
+        """One output's rows, one series per recording, scaled to a common noise level."""
         alike = np.ones((len(rows), rows.shape[2])) if self.level is None else self.level
         pairs = zip(rows, self.mask, alike[:, output], strict=True)
         return [r[m, output] / level for r, m, level in pairs]
@@ -68,7 +67,7 @@ class Data(eqx.Module):
     def white(
         self, x: Float[np.ndarray, "recordings samples outputs *columns"], noise: Sequence[ARFilter]
     ) -> Float[np.ndarray, "recordings samples outputs *columns"]:
-        """Rows through the inverse of the noise filters, all at the same level of noise."""
+        """Rows through the inverse of the noise filters, scaled to a common noise level."""
         out = whitened(x, noise, self.mask)
         if self.level is not None:
             level = self.level.astype(x.dtype)[:, None]
@@ -76,12 +75,12 @@ class Data(eqx.Module):
         return out
 
     def middle(self, most: int, least: int = 1000) -> "Data":
-        """The middle of each recording, so that no more than `most` rows are left in all.
+        """The middle of each recording, with at most `most` rows in total.
 
         **Arguments:**
 
-        - `least`: samples of each that are left in any case: of many short pieces, next to nothing
-          would be left of each once its noise filter is filled.
+        - `least`: number of samples of each recording that are always kept. Otherwise short pieces
+          would have almost no samples after their noise filter is filled.
         """
         recordings, samples, outputs = self.residual.shape
         length = max(least, most // (recordings * outputs))
@@ -115,8 +114,8 @@ def whitened(
         for k, there in enumerate(mask):
             wide = x[k, :, j].reshape(x.shape[1], -1)
             out[k, :, j] = _through(taps, wide).reshape(out[k, :, j].shape)
-            # The filter does not know what came before the first sample; to call it zero would
-            # make outliers of the first rows, which anything that starts with a step explains.
+            # The past of the first samples is unknown. With zeros the first rows would be outliers,
+            # which any signature that starts with a step could explain.
             out[k, : int(np.argmax(there)) + filt.order, j] = 0.0
     out[~mask] = 0.0
     return out
@@ -127,7 +126,7 @@ def _through(
 ) -> Float[np.ndarray, "samples columns"]:
     """Moving average along the samples, as products with one banded matrix; zero before the first.
 
-    SciPy's `lfilter` takes a convolution a column, five times as slow with a thousand of them.
+    SciPy's `lfilter` needs one convolution per column and is five times as slow for a thousand.
     """
     import scipy
 
@@ -149,23 +148,23 @@ def _through(
 
 
 def spanned(x: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows rank"]:
-    """Orthonormal columns of the same span, whatever the units of each column."""
+    """Orthonormal columns of the same span, for columns in any units."""
     size = np.linalg.norm(x, axis=0)
     basis, values, _ = np.linalg.svd(x[:, size > 0] / size[size > 0], full_matrices=False)
     return basis[:, values > 1e-9 * values[0]] if len(values) else basis
 
 
 def strong_directions(x: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows rank"]:
-    """Orthonormal columns of the span of signatures, what is next to nothing of them left out."""
+    """Orthonormal columns of the span of signatures, without almost zero directions."""
     basis, size, _ = np.linalg.svd(x, full_matrices=False)
     return basis[:, size**2 > WEAK]
 
 
 class Whitened(eqx.Module):
-    """Residual and signatures, whitened, with what the base absorbs projected out.
+    """Residual and signatures, whitened, with the base projected out.
 
-    Signatures are scaled by `size`, their length before the projection; `count` is the freedom
-    that noise has left.
+    Signatures are scaled by `size`, their norm before the projection; `count` is the number of
+    remaining degrees of freedom.
     """
 
     residual: Float[np.ndarray, " rows"]
@@ -186,7 +185,7 @@ class Whitened(eqx.Module):
         r = r - basis @ (basis.T @ r)
         single = basis.astype(x.dtype)
         across = single.T @ x
-        # By parts: the whole product would be as large as the table once more.
+        # In parts, because the whole product would be as large as the table.
         parts = 1 + len(x) // 10_000
         for some, of in zip(np.array_split(x, parts), np.array_split(single, parts), strict=True):
             some -= of @ across
@@ -202,8 +201,8 @@ class Whitened(eqx.Module):
 class Gram(eqx.Module):
     """Products of the signatures with each other and with the residual, as `Whitened` has them.
 
-    `rest` is what the base leaves of the squared residual, `count` its freedom. `kept` are the
-    numbers of the columns that are there; None where all of them are.
+    `rest` is the squared residual after projection of the base, `count` its degrees of freedom.
+    `kept` are the numbers of the columns; None for all columns.
     """
 
     gram: Float[np.ndarray, "columns columns"]
@@ -214,23 +213,23 @@ class Gram(eqx.Module):
     kept: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     def only(self, numbers: Sequence[int]) -> "Gram":
-        """The same with these columns alone."""
+        """The same with only these columns."""
         at = _places(numbers, self.kept)
         gram, score, size = self.gram[np.ix_(at, at)], self.score[at], self.size[at]
         return Gram(gram, score, size, self.rest, self.count, tuple(numbers))
 
     @classmethod
     def of(cls, data: Data, noise: Sequence[ARFilter]) -> "Gram":
-        """Whitens, projects the base out, and forms the products that tests need."""
+        """Whitens, projects the base out, and computes the products for tests."""
         return cls.of_whitened(Whitened.of(data, noise))
 
     @classmethod
     def of_whitened(cls, white: Whitened) -> "Gram":
-        """The products of what is whitened already."""
+        """The products of whitened data."""
         import scipy
 
         x = white.signatures
-        # BLAS counts by columns: what it calls upper is our lower half.
+        # BLAS stores columns first, so its upper half is our lower half.
         half = scipy.linalg.blas.ssyrk(1.0, x.T).astype(float)
         gram = np.triu(half) + np.triu(half, 1).T
         rest = float(white.residual @ white.residual)
@@ -260,7 +259,7 @@ class Gram(eqx.Module):
         return value, freedom
 
     def correlation(self, one: Sequence[int], other: Sequence[int]) -> float:
-        """Largest correlation of what two blocks of columns span, 0 where one says nothing."""
+        """Largest correlation between the spans of two blocks of columns; 0 if one is empty."""
         whole = []
         first, second = _places(one, self.kept), _places(other, self.kept)
         for columns in (first, second):
@@ -277,14 +276,14 @@ class Gram(eqx.Module):
         return inverse @ self.score[chosen] / scale, inverse / np.outer(scale, scale)
 
 
-# A signature of which the base parameters absorb all but this share of the power says nothing.
+# A signature is ignored if the base absorbs all but this share of its power.
 WEAK = 1e-5
 
 
 def by_width(
     blocks: Blocks,
 ) -> list[tuple[Int[np.ndarray, " some"], Int[np.ndarray, "some width"]]]:
-    """Places and columns of blocks of equal width together, so that they can be done at once."""
+    """Places and columns of blocks grouped by width, for computation in batches."""
     widths = np.array([len(block) for block in blocks])
     return [
         (places, np.array([list(blocks[int(k)]) for k in places]))
@@ -312,13 +311,13 @@ def _inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
 def _strong(
     matrix: Float[np.ndarray, "n n"],
 ) -> tuple[Float[np.ndarray, " strong"], Float[np.ndarray, "n strong"]]:
-    """Eigenvalues and vectors of what the base has left enough of."""
+    """Eigenvalues and eigenvectors of directions that the base does not absorb."""
     values, vectors = np.linalg.eigh(matrix)
     strong = values > WEAK
     return values[strong], vectors[:, strong]
 
 
-# --- p-values that count how many were asked ---------------------------------------------------
+# --- p-values corrected for the number of tests --------------------------------------------------
 
 
 def chance(value: float, freedom: int) -> float:
@@ -329,9 +328,9 @@ def chance(value: float, freedom: int) -> float:
 
 
 def effective_tests(gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0) -> float:
-    """How many independent tests the blocks amount to, by drawing noise in their own space.
+    """Effective number of independent tests of the blocks, by noise drawn in their space.
 
-    The smallest p-value of correlated tests is distributed as that of fewer independent ones.
+    The smallest p-value of correlated tests has the distribution of that of fewer independent ones.
     """
     import scipy
 
@@ -344,22 +343,22 @@ def effective_tests(gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0
         for k in {int(f) for f in freedom if f > 0}:
             most = value[freedom == k].max(axis=0)
             smallest = np.minimum(smallest, scipy.stats.chi2.sf(most, k))
-    # Correlated tests part company in the tail: a match of the mean would be three times too kind
-    # there, so the number is that of independent tests with the same lowest tenth.
+    # The number is that of independent tests with the same lowest decile. A match of the mean would
+    # give p-values in the tail that are three times too small.
     lowest = float(np.quantile(smallest, 0.1))
     return max(1.0, float(np.log(0.9) / np.log1p(-lowest)))
 
 
 def _root(gram: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """A matrix whose product with its transpose is a Gram matrix, rounding aside."""
+    """A matrix whose product with its transpose is a Gram matrix, up to rounding."""
     try:
         return np.linalg.cholesky(gram + 1e-5 * np.eye(len(gram)))
     except np.linalg.LinAlgError:
-        # Columns of single precision that nearly all point one way.
+        # Single-precision columns that are almost parallel.
         values, vectors = np.linalg.eigh(gram)
         return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def corrected(p: float, tests: float) -> float:
-    """The p-value of the smallest of so many tests (Šidák 1967)."""
+    """The p-value of the smallest of a number of tests (Šidák 1967)."""
     return float(-np.expm1(tests * np.log1p(-min(p, 1 - 1e-16))))

@@ -1,4 +1,4 @@
-"""Noise told apart from physics: its filters are estimated with every effect in the model."""
+"""Separation of noise and physics: noise filters are estimated with all effects in the model."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ from .score import (
 
 
 class Separated(eqx.Module):
-    """Noise told apart: its filters, one an output, and the blocks picked to leave it alone.
+    """The noise filters, one per output, and the blocks that were selected with them.
 
-    `data` has the level of noise of each recording; `bic` is of filters, levels and blocks.
+    `data` has the noise level of each recording; `bic` is that of filters, levels and blocks.
     """
 
     data: Data
@@ -32,16 +32,17 @@ class Separated(eqx.Module):
 
 
 def estimate_noise(data: Data, blocks: Blocks, alike: bool = False) -> Separated:
-    """The noise filters and levels, and the blocks that were picked to leave noise alone.
+    """The noise filters and levels, and the blocks that were selected with them.
 
-    Two starts: what the base leaves, whose filter may take a spring's slow pull for noise, and what
-    the base and the blocks that matter most to plain least squares leave, which have taken a share
-    of slow noise with them. From each, blocks are picked through the filter and the filter is
-    estimated again with those in the model; the likelier of the two ends, by BIC, is believed.
+    There are two starting points. The first is the residual of the base; its filter may model a
+    slow missing effect, such as a spring, as noise. The second is the residual of the base and the
+    blocks that plain least squares selects, which may have absorbed slow noise. From each, blocks
+    are selected through the filter, and the filter is estimated again with these in the model. The
+    result with the better BIC is used.
 
     **Arguments:**
 
-    - `alike`: whether noise has one level in all of the data, which are windows of recordings.
+    - `alike`: whether all data have one noise level, because they are windows of recordings.
     """
     flat = tuple(
         ARFilter(np.zeros(0), float(np.mean(np.concatenate(data.series(data.residual, j)) ** 2)))
@@ -58,7 +59,7 @@ def estimate_noise(data: Data, blocks: Blocks, alike: bool = False) -> Separated
 
 
 def _settle(data: Data, noise: tuple[ARFilter, ...], blocks: Blocks, alike: bool) -> Separated:
-    """Picks signatures and estimates the filter in turn."""
+    """Alternates the selection of signatures and the estimation of the filter."""
     chosen: list[int] = []
     columns: list[int] = []
     for _ in range(2):
@@ -85,12 +86,12 @@ def columns_of(blocks: Blocks, chosen: Sequence[int]) -> list[int]:
 
 
 def noise_of(data: Data, rows: Rows, lost: float, highest: int = 30) -> tuple[ARFilter, ...]:
-    """One AR filter an output, its variance corrected for the freedom the model has taken.
+    """One AR filter per output, with the variance corrected for the model's degrees of freedom.
 
     **Arguments:**
 
-    - `rows`: the residual with what a model explains taken out.
-    - `lost`: how many parameters that model has.
+    - `rows`: the residual of a model.
+    - `lost`: number of parameters of that model.
     - `highest`: largest order.
     """
     outputs = rows.shape[2]
@@ -105,31 +106,31 @@ def noise_of(data: Data, rows: Rows, lost: float, highest: int = 30) -> tuple[AR
 
 
 def filter_of(series: Sequence[Float[np.ndarray, " _"]], highest: int) -> ARFilter:
-    """The AR filter of one output's residuals, whose memory is short beside the recordings.
+    """The AR filter of one output's residuals, with a memory much shorter than the recordings.
 
-    What changes as slowly as the recordings themselves cannot be told from what a model lacks: a
-    filter that is free to call it noise makes up for a spring.
+    Slower noise cannot be separated from a missing effect: a filter with a long memory would model
+    the torque of a spring as noise.
     """
     found = fit_ar(series, highest=highest, criterion="bic")
     return found.forgetting(max(len(x) for x in series) / _MEMORIES, series)
 
 
-# How often in a recording noise forgets what it was, at the least.
+# Smallest ratio of the length of the longest recording to the memory of a filter.
 _MEMORIES = 10
 
 
 def levelled(
     data: Data, rows: Rows, lost: float, alike: bool = False
 ) -> tuple[Data, tuple[ARFilter, ...]]:
-    """The data with the level of noise of each recording, and the filters of all.
+    """The data with the noise level of each recording, and the common filters.
 
-    An output has levels where its recordings differ by more than chance (BIC): a motion that is
-    slow and one that is fast need not have the same noise, and to pool them would make p-values of
-    what acts in the louder one too small.
+    An output has several levels if its recordings differ significantly (BIC). Slow and fast motions
+    may have different noise; with a common level, p-values of effects in the noisier recording
+    would be too small.
 
     **Arguments:** as for `noise_of`, and
 
-    - `alike`: whether there is but one level.
+    - `alike`: whether there is only one level.
     """
     data = dataclasses.replace(data, level=None)
     noise = noise_of(data, rows, lost)
@@ -149,7 +150,7 @@ def levelled(
 
 
 def leftover(data: Data, noise: Sequence[ARFilter], columns: Sequence[int]) -> Rows:
-    """The residual less the best combination of base and some signatures, whitened by `noise`."""
+    """The residual minus the best combination of base and signatures, whitened by `noise`."""
     picked = data.columns(columns).astype(float)
     wide = np.concatenate([data.base, picked], axis=-1)
     w = data.white(wide, noise).reshape(-1, wide.shape[-1])
@@ -164,15 +165,15 @@ def leftover(data: Data, noise: Sequence[ARFilter], columns: Sequence[int]) -> R
 
 
 def select(white: Whitened, blocks: Blocks, most: int = 12, margin: float = 10.0) -> list[int]:
-    """Blocks picked greedily while each explains more than chance, by a margin.
+    """Blocks selected greedily while each explains more than chance, by a margin.
 
-    Signatures stay as they are; what the blocks picked so far explain is taken out of the products
-    that the next pick needs.
+    Signatures are not changed; the selected blocks are projected out of the products for the next
+    selection.
 
     **Arguments:**
 
-    - `most`: how many at the most.
-    - `margin`: what a block must explain beyond log(samples) for each of its columns.
+    - `most`: largest number of blocks.
+    - `margin`: amount that a block must explain beyond log(samples) for each of its columns.
     """
     x, score, price = white.signatures, white.score(), float(np.log(white.count))
     grouped = [(places, columns, _inner(x, columns)) for places, columns in by_width(blocks)]

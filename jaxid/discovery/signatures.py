@@ -1,4 +1,4 @@
-"""Signatures: what the closed loop would have shown, had an effect been there."""
+"""Signatures: the change of the closed loop's output that an effect would cause."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -27,8 +27,8 @@ from .linear import Linearised, respond
 def _settled_states(effect: AbstractEffect, motion: Motion) -> Float[Array, "points states"]:
     """The effect's own states along a motion, by an exponential step for each interval.
 
-    States relax with rates that friction and lags make stiff; the step is exact where the rate is
-    linear in its state and goes as a line from sample to sample.
+    Friction and lags make the states stiff. The step is exact if the rate is linear in the state
+    and its input is linear from sample to sample.
     """
     first = jax.tree.map(lambda leaf: leaf[0], motion)
     start = effect.settled(eqx.tree_at(lambda m: m.state, first, effect.initial_state()))
@@ -56,7 +56,7 @@ def _relaxed(
     rate: Float[Array, " states"],
     change: Float[Array, " states"],
 ) -> Float[Array, " states"]:
-    """How far x goes in unit time, with x' = slope (x - x0) + rate + t change."""
+    """Change of x in unit time, with x' = slope (x - x0) + rate + t change."""
     n = rate.shape[0]
     if n == 1:
         s = slope[0, 0]
@@ -65,7 +65,7 @@ def _relaxed(
         first = jnp.where(small, 1 + s / 2, jnp.expm1(safe) / safe)
         second = jnp.where(small, 0.5 + s / 6, (first - 1) / safe)
         return first * rate + second * change
-    # Van Loan 1978: the integrals stand beside the exponential of a larger matrix.
+    # The integrals are blocks of the exponential of a larger matrix (Van Loan 1978).
     matrix = jnp.zeros((n + 2, n + 2)).at[:n, :n].set(slope).at[n + 1, n].set(1.0)
     return exponential(matrix.at[:n, n].set(rate).at[:n, n + 1].set(change))[:n, n]
 
@@ -75,11 +75,11 @@ _COORDINATES = ("q", "v", "a", "tau")
 
 
 class Placed(eqx.Module):
-    """An effect as if its joints were the first, and which joints those are.
+    """An effect with its joints renumbered as the first ones, and the order of the joints.
 
-    The order of the joints is data, so that one program serves an effect on any of them. The
-    coordinate of a curve is data as well: `along` is its number among time and the positions,
-    velocities, accelerations and torques of all joints, and takes the place of time.
+    The order of the joints is data, so one program serves an effect on any joint. The coordinate of
+    a curve is data as well: `along` is its index among time and the positions, velocities,
+    accelerations and torques of all joints, and takes the place of time.
     """
 
     effect: AbstractEffect
@@ -88,7 +88,7 @@ class Placed(eqx.Module):
 
     @classmethod
     def of(cls, effect: AbstractEffect, joints: int) -> "Placed":
-        """An effect of an arm; one that does not say which joints it depends on stays as it is."""
+        """An effect of an arm; unchanged if it does not declare the joints on which it depends."""
         along = None
         if isinstance(effect, Curve):
             if effect.coordinate != "t":
@@ -117,7 +117,7 @@ class Placed(eqx.Module):
         return eqx.tree_at(rows, motion, [x[..., self.order] for x in rows(motion)])
 
     def back(self, forces: Any) -> Any:
-        """What was found of the joints in that order, `(points, joints, ...)`, in the arm's."""
+        """Results in that order of joints, `(points, joints, ...)`, in the arm's order."""
         return jax.tree.map(lambda x: x[:, jnp.argsort(self.order)], forces)
 
 
@@ -134,7 +134,7 @@ AllForces = tuple[
 
 
 def _forces(effect: AbstractEffect, motion: Motion, left: Float[Array, "points joints"]) -> Forces:
-    """What the effect adds to joint torque, position read and velocity read, by amplitude."""
+    """Additions to joint torque, position reading and velocity reading, by amplitude."""
     linear = amplitudes(effect)
     along = _force_by(effect, linear, motion, left)
     if linear:
@@ -152,7 +152,7 @@ def _force_by(
 
     def along(values: Float[Array, " values"]):
         here = write_values(effect, parameters, values) if parameters else effect
-        # Here, since a parameter may stand in the rate of a state.
+        # Computed here, because a parameter may affect the rate of a state.
         states = _settled_states(here, motion)
 
         def one(at: Motion, state, rest):
@@ -172,15 +172,16 @@ def force_and_slopes(
     left: Float[Array, "recordings points joints"],
     fields: tuple[str, ...] | None = None,
 ) -> Forces:
-    """What an effect adds along each run, and the slopes of that by its free parameters.
+    """Additions by an effect along each run, and their derivatives by its free parameters.
 
     **Arguments:**
 
-    - `motion`: nominal, `(recordings, points)` first. `left`: torque left for the links, N·m or N.
-    - `fields`: names of the fields by which slopes are taken; by default those that are free.
+    - `motion`: nominal, `(recordings, points)` first. `left`: torque that remains for the links,
+      N·m or N.
+    - `fields`: names of the fields for derivatives; by default those of free parameters.
 
-    **Returns:** torque on the joint, N·m or N, position read, rad or m, and velocity read, rad/s or
-    m/s; the first column is the value, the others are slopes.
+    **Returns:** torque on the joint, N·m or N, position reading, rad or m, and velocity reading,
+    rad/s or m/s; the first column is the value, the others are derivatives.
     """
     return one_by_one(lambda one: _force_and_slopes(placed, *one, fields), (motion, left))
 
@@ -208,7 +209,7 @@ def _force_and_slopes(
 
 
 def left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings points joints"]:
-    """Torque that the loop's own effects on the drives leave for the links along the runs."""
+    """Torque that remains for the links after the loop's effects on the drives, along the runs."""
     return one_by_one(lambda one: _left_for_links(loop, one), motion)
 
 
@@ -230,10 +231,10 @@ def _all_forces(
     motion: Motion,
     left: Float[Array, "recordings points joints"],
 ) -> AllForces:
-    """Forces of all hypotheses: one trace for each structure, `vmap` over its settings.
+    """Forces of all hypotheses, with one trace for each structure and a `vmap` over its settings.
 
-    It does not know the loop, so that it is compiled once however the model grows. What is added to
-    sensors is of those effects alone that act there.
+    It does not depend on the loop, so it is not compiled again when the model grows. Additions to
+    sensor readings are computed only for effects of sensors.
     """
 
     def of_run(run: Motion, left) -> AllForces:
@@ -261,17 +262,17 @@ def _all_forces(
 
 
 def _by_point(x: Float[Array, "settings points joints columns"]) -> Float[Array, "..."]:
-    """`(points, joints, settings · columns)`."""
+    """The same array as `(points, joints, settings · columns)`."""
     return jnp.moveaxis(x, 0, 2).reshape(*x.shape[1:3], -1)
 
 
 def _misreads(effect: AbstractEffect) -> bool:
-    """Whether the effect is one of the sensors."""
+    """Whether the effect acts on a sensor's reading."""
     return type(effect).read is not AbstractEffect.read
 
 
 def _grouped(effects: Sequence[AbstractEffect], joints: int) -> list[tuple[Placed, list[int]]]:
-    """Effects that a program serves together stacked, with their places."""
+    """Effects that share one program, stacked, with their places."""
     placed = [Placed.of(effect, joints) for effect in effects]
     return [
         (jax.tree.map(lambda *leaves: np.stack(leaves), *(placed[k] for k in places)), places)
@@ -285,9 +286,9 @@ def _responses(
     stacks: list[Placed],
     hypotheses: Sequence[Hypothesis],
 ) -> Float[np.ndarray, "recordings points outputs columns"]:
-    """What effects that are inputs of the linear system show, one run after the other.
+    """Responses to effects that are inputs of the linear system, one run after the other.
 
-    The forces of all runs at once would be several times as large as the table.
+    The forces of all runs together would be several times as large as the table.
     """
     reading = _columns(hypotheses, _misreads)
     behind = _columns(hypotheses, lambda e: e.on_link) if "pull" in linear.places else []
@@ -321,10 +322,11 @@ def signatures(
     row: int,
     say: Callable[[str], None],
 ) -> tuple[list[Hypothesis], Float[np.ndarray, "recordings points outputs columns"]]:
-    """Hypotheses and the table of their signatures, one column an amplitude.
+    """Hypotheses and the table of their signatures, one column per amplitude.
 
-    Effects that act at the joint, on the command or on the sensor: the response of the linear
-    system. Transmissions and limits: what a simulation with them differs by from the nominal one.
+    For effects at the joint, on the command or on the sensor, a signature is the response of the
+    linear system. For transmissions and limits it is the difference between a simulation with the
+    effect and the nominal one.
     """
     direct = [k for k, (effect, _) in enumerate(proposed) if not effect.finite]
     made: dict[int, Hypothesis] = {}
@@ -347,7 +349,7 @@ def signatures(
     changes = differences(loop, batch, [proposed[k][0] for k in rest], row, nominal)
     for place, change in zip(rest, changes, strict=True):
         effect, tests = proposed[place]
-        with np.errstate(over="ignore"):  # a loop that runs away is left out
+        with np.errstate(over="ignore"):  # a diverging loop is left out
             column = change.astype(np.float32)
         if np.isfinite(column).all():
             blocks.append(column[..., None])
@@ -357,7 +359,7 @@ def signatures(
 
 
 def _amplitude_bounds(effect: AbstractEffect) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Bounds of every amplitude; of a finite setting, how much of it there is: more than none."""
+    """Bounds of every amplitude; for a finite setting, of its multiple, which is positive."""
     linear = amplitudes(effect)
     if not linear:
         return (0.0,), (np.inf,)

@@ -1,4 +1,4 @@
-"""A model said in a simulator's terms, and the error that each thing they do not say leaves."""
+"""A model in a simulator's parameters, and the error due to effects that these cannot express."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -21,15 +21,14 @@ if TYPE_CHECKING:
 
 
 class SimulatorTerms(eqx.Module):
-    """What to type into a simulator for each joint, and what that leaves out.
+    """A simulator's parameters for each joint, and the effects that are left out.
 
-    - `joints`: by the names of recordings whose drives were told the same, the terms of each joint.
-    - `loops`: by choice: the model as it was identified, without each effect that there is no term
-      for, without all of them, and without them with the rest fitted again, to which `joints` then
-      belong.
-    - `reasons`: why there is no term, by the choice that leaves it out.
-    - `errors`: mean over the recordings of the relative error of what the model is judged by, by
-      choice and joint, %.
+    - `joints`: the terms of each joint, by the names of recordings with the same drive settings.
+    - `loops`: models by choice: as identified, without each effect that has no term, without all
+      such effects, and the latter fitted again; `joints` belong to the last one.
+    - `reasons`: why an effect has no term, by the choice that leaves it out.
+    - `errors`: relative error of the judged signal, mean over the recordings, by choice and joint,
+      %.
     """
 
     joints: dict[tuple[str, ...], tuple[JointTerms, ...]]
@@ -49,13 +48,13 @@ class SimulatorTerms(eqx.Module):
         return pd.DataFrame(rows).T.rename_axis(["recordings", "joint"])
 
     def choices(self) -> "pd.DataFrame":
-        """The error that each choice leaves, and why what it leaves out cannot be said."""
+        """The error of each choice, and the reason why its effect cannot be expressed."""
         return self.errors.assign(reason=[self.reasons.get(c, "") for c in self.errors.index])
 
     def __repr__(self) -> str:
         terms = self.table().to_string(float_format=lambda x: f"{x:.4g}")
         choices = self.choices().to_string(float_format=lambda x: f"{x:.4g}")
-        return f"{terms}\n\nrelative error in % of what can be chosen:\n{choices}"
+        return f"{terms}\n\nrelative error in % by choice:\n{choices}"
 
 
 def simulator_terms(
@@ -65,25 +64,26 @@ def simulator_terms(
     refit: bool = True,
     method: OEM | None = None,
 ) -> SimulatorTerms:
-    """Says a model as armature, damping, frictionloss, kp, kd, forcerange and delay.
+    """Expresses a model by armature, damping, frictionloss, kp, kd, forcerange and delay.
 
-    These are MuJoCo's terms, which Isaac and most trainers of legged robots took over. A motor's
-    back-EMF is damping that no limit cuts off, and the limit of its voltage is one of torque.
+    These are MuJoCo's parameters, which Isaac and most training environments for legged robots also
+    use. A motor's back-EMF is damping outside the torque limit; the limit of its voltage is a limit
+    of torque.
 
     **Arguments:**
 
     - `model`: a fit or a loop.
-    - `recordings`: on which errors are compared; those of the fit where None.
-    - `refit`: whether what can be said is fitted again without the rest, and the terms are those
-      that are found then.
-    - `method`: of that fit; that of the fit, or the default.
+    - `recordings`: for the comparison of errors; those of the fit if None.
+    - `refit`: whether the model without the other effects is fitted again; the terms are then those
+      of this fit.
+    - `method`: method of that fit; by default that of the fit, or `OEM()`.
 
     **Raises:** `FitError` for a loop without recordings.
     """
     loop = model.loop if isinstance(model, Fit) else model
     if recordings is None:
         if not isinstance(model, Fit):
-            raise FitError("a loop has no recordings to compare choices on: give some")
+            raise FitError("a loop has no recordings for the comparison of choices: give some")
         recordings = model.recordings
     recordings = Recordings.of(recordings)
     method = method or oem_of(model)
@@ -98,7 +98,7 @@ _PLAIN = "in these terms"
 
 
 def _choices(loop: ClosedLoop) -> tuple[dict[str, ClosedLoop], dict[str, str]]:
-    """The loop as it is, without each effect that cannot be said, and without all of them."""
+    """The unchanged loop, without each effect that cannot be expressed, and without all of them."""
     loops, reasons = {"as identified": loop}, {}
     why = unsaid(loop)
     if -1 in why:
@@ -118,7 +118,7 @@ def _choices(loop: ClosedLoop) -> tuple[dict[str, ClosedLoop], dict[str, str]]:
 def _told(
     loop: ClosedLoop, recordings: Recordings
 ) -> dict[tuple[str, ...], tuple[JointTerms, ...]]:
-    """The terms by the recordings whose drives were told the same, in the middle of each."""
+    """The terms by recordings with the same drive settings, at the medians of these."""
     groups: dict[Any, tuple[list[str], dict[str, np.ndarray]]] = {}
     for r in recordings:
         told = {name: np.median(getattr(r, name), axis=0) for name in r.held_names}
@@ -135,7 +135,7 @@ def _errors(loops: dict[str, ClosedLoop], recordings: Recordings) -> "pd.DataFra
         try:
             rows[label] = compare(loop, recordings).error_percent.mean()
         except FitError:
-            # Without a part that holds it, a loop may run away.
+            # A loop may diverge without an effect that stabilises it.
             rows[label] = np.inf * compare(loops["as identified"], recordings).error_percent.mean()
     return pd.DataFrame(rows).T.rename_axis("choice")
 

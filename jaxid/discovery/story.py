@@ -1,4 +1,4 @@
-"""The story that a discovery tells: its steps, its verdict, how it shows itself."""
+"""The result of a discovery: its steps, its verdict, and its display."""
 
 import html
 import os
@@ -41,11 +41,11 @@ _SHOWN = 8
 
 
 class Step(eqx.Module):
-    """The model with one more of the effects that were found.
+    """The model with one more of the added effects.
 
-    `diagnosis` is there where the search went on from this model, and for the first and last step.
-    `added` is the effect that this step's model has over the last one's; `probability` the weight
-    of all models that have it; `alike` what these recordings cannot tell from it.
+    `diagnosis` exists if the search continued from this model, and for the first and last step.
+    `added` is the effect that this step adds to the previous one; `probability` is the weight of
+    all models with it; `alike` are effects that these recordings cannot distinguish from it.
     """
 
     label: str
@@ -58,14 +58,14 @@ class Step(eqx.Module):
 
 
 class Discovery(AbstractShown):
-    """The story: what the model lacked, step by step, and where it stopped.
+    """The story of a search: the effects that the model lacked, step by step, and the verdict.
 
     - `verdict`: `"adequate"`, `"explained"`, `"outside_catalogue"` or `"undetermined"`.
     - `steps`: the first is the starting model.
     - `reason`: why it is undetermined, and what to do; empty for the other verdicts.
-    - `considered`: the models that were looked at, best first.
-    - `removed`: effects that were added and later found not to be needed.
-    - `unfinished`: whether it stopped, as told, while an effect of the catalogue was still to add.
+    - `considered`: the examined models, best first.
+    - `removed`: effects that were added, and removed later because they were not needed.
+    - `unfinished`: whether the limit `most` stopped the search before all effects were added.
     - `interrupted`: whether the search was interrupted; the last step is the best model until then.
     """
 
@@ -91,7 +91,7 @@ class Discovery(AbstractShown):
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """The diagnosis of the model at the end; of an interrupted search the last there is."""
+        """The diagnosis of the model at the end; of an interrupted search, the last diagnosis."""
         return [step.diagnosis for step in self.steps if step.diagnosis is not None][-1]
 
     @property
@@ -115,7 +115,7 @@ class Discovery(AbstractShown):
                 f"{best}{self.reason}."
             )
         if self.unfinished and not added:
-            return f"The model of {self.loop.name} lacks something, and was to be left as it is."
+            return f"The model of {self.loop.name} lacks an effect, but none was to be added."
         if self.verdict == "adequate":
             return (
                 f"The model of {self.loop.name} describes these recordings down to their noise: "
@@ -123,8 +123,8 @@ class Discovery(AbstractShown):
             )
         if self.unfinished:
             return (
-                f"The model lacked {' and '.join(added)}, and lacks more: the search was told to "
-                "stop there."
+                f"The model lacked {' and '.join(added)}, and is still incomplete: the search was "
+                "told to stop there."
             )
         if self.verdict == "explained":
             return f"The model lacked {' and '.join(added)}; with that, nothing is left to explain."
@@ -137,12 +137,12 @@ class Discovery(AbstractShown):
         on = "time" if curve.coordinate == "t" else f"the {curve.spoken_coordinate}"
         how = " and on the direction of motion" if curve.signed else ""
         return _upper(
-            f"{lacked}no effect of the catalogue explains how the torque of joint "
-            f"{hypothesis.joint}, as it is left, depends on {on}{how}."
+            f"{lacked}no effect of the catalogue explains how the residual torque of joint "
+            f"{hypothesis.joint} depends on {on}{how}."
         )
 
     def _sure(self) -> str:
-        """The probability that the starting model suffices, as a sentence goes on."""
+        """The probability of the starting model, as part of a sentence."""
         start = next((m for m in self.considered if not m.effects and m.curve is None), None)
         return "" if start is None else f" (probability {odds(start.weight)})"
 
@@ -163,16 +163,16 @@ class Discovery(AbstractShown):
 
     @property
     def models(self) -> "pd.DataFrame":
-        """The models that were looked at, best first, as ArviZ's `compare` has it.
+        """The examined models, best first, in the form of ArviZ's `compare`.
 
-        Score and weight are of the fitted recordings alone. Errors are in %; those on held-out
-        recordings are of models that were fitted in full and are a step of the story or have a
-        weight of a hundredth.
+        Score and weight depend on the fitted recordings only. Errors are in %. Errors on held-out
+        recordings exist for fully fitted models that are a step of the story or have a weight of at
+        least a hundredth.
         """
         return models_table(self.considered)
 
     def contenders(self, step: int) -> tuple[Model, ...]:
-        """The models with one effect in another's place that were fitted in full, best first.
+        """Fully fitted models in which another effect replaces that of a step, best first.
 
         **Arguments:**
 
@@ -195,15 +195,15 @@ class Discovery(AbstractShown):
         joint: int | None = None,
         recordings: Recording | Recordings | Iterable[Recording] | None = None,
     ) -> EffectCurve:
-        """An effect of the last model over what it depends on, over the residual without it.
+        """Torque of an effect of the last model over its coordinate, and the residual without it.
 
         **Arguments:**
 
         - `effect`: its name as in tables, or the effect itself, one of `loop.effects`.
-        - `joint`: on which it is, counted from 1; of an effect on all joints, the one to show.
-        - `recordings`: along which; those that were fitted by default.
+        - `joint`: joint of the effect, from 1; for an effect on all joints, the one to show.
+        - `recordings`: by default the fitted ones.
 
-        **Raises:** as `effect_curve` does.
+        **Raises:** the errors of `effect_curve`.
         """
         return effect_curve(self.fit, effect, joint, recordings)
 
@@ -214,12 +214,12 @@ class Discovery(AbstractShown):
 
         - `model`: its row, from 0, or its name.
 
-        **Raises:** `ModelError` where there is no such model.
+        **Raises:** `ModelError` if there is no such model.
         """
         chosen = picked(self.considered, model)
         if chosen.fit is not None:
             return chosen.fit
-        # An effect may be there twice.
+        # The model may have an effect twice.
         there = Counter(map(form, chosen.effects))
         parts = [
             m
@@ -255,7 +255,7 @@ class Discovery(AbstractShown):
         return self.diagnosis.floor_percent()
 
     def _floor_sources(self) -> list[str]:
-        """Where the noise floor is from, and its interval where it was measured."""
+        """Sources of the noise floor, with its interval if it was measured."""
         joints = joint_columns(self.loop.joints)
         measured = self.diagnosis.measured
         by_source: dict[str, list[str]] = {}
@@ -270,9 +270,9 @@ class Discovery(AbstractShown):
         return [f"noise floor {s}: {', '.join(labels)}" for s, labels in by_source.items()]
 
     def suggestion(self) -> Curve:
-        """The free-form curve that explains most of what is left, ready to be added.
+        """The free-form curve that explains most of the residual, ready to be added.
 
-        **Raises:** `ModelError` where nothing is left.
+        **Raises:** `ModelError` if the residual is not significant.
         """
         if not self.diagnosis.depends_on():
             raise ModelError("nothing significant is left, so there is no curve to suggest")
@@ -281,18 +281,18 @@ class Discovery(AbstractShown):
         return curve
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Writes the story to one file, from which `jaxid.load` gives it back.
+        """Writes the story to one file, which `jaxid.load` reads.
 
         **Arguments:**
 
-        - `path`: by convention with the ending `.jaxid`; a file that is there is replaced.
+        - `path`: by convention with the ending `.jaxid`; an existing file is replaced.
 
-        **Raises:** `SaveError` where it cannot be written.
+        **Raises:** `SaveError` if it cannot be written.
         """
         return save(self, path)
 
     def to_dict(self) -> dict[str, Any]:
-        """The story as plain JSON, as `jaxid discover --json` writes it."""
+        """The story as plain JSON, the format of `jaxid discover --json`."""
         first, last = self.steps[0], self.steps[-1]
         outside = self.verdict == "outside_catalogue"
         return {
@@ -345,7 +345,7 @@ class Discovery(AbstractShown):
         return "\n".join([*lines, *(x for note in self.notes for x in wrapped(note))])
 
     def _found(self) -> list[str]:
-        """Each added effect with its probability and values, and what it cannot be told from."""
+        """Each added effect with its probability, values, and indistinguishable alternatives."""
         lines = []
         for k, step in enumerate(s for s in self.steps if s.added is not None):
             values = _found_parameters(self.steps, k)
@@ -359,7 +359,7 @@ class Discovery(AbstractShown):
             lines.append(f"{step_name(step)}{sure}: {shown}")
             if step.alike:
                 others = ", ".join(effect_on(n, j) for n, j in step.alike)
-                lines.append(f"these recordings cannot tell {step_name(step)} from {others}")
+                lines.append(f"these recordings cannot distinguish {step_name(step)} from {others}")
         return lines
 
     def _repr_html_(self) -> str:
@@ -376,7 +376,7 @@ class Discovery(AbstractShown):
 
 
 def odds(share: float) -> str:
-    """A probability that is no more certain than its digits."""
+    """A probability in words with few digits, such as `> 0.999`."""
     if share < 0.001:
         return "< 0.001"
     return "> 0.999" if share > 0.999 else f"{share:.3g}"
@@ -387,7 +387,7 @@ def _upper(sentence: str) -> str:
 
 
 def _spoken(steps: Sequence[Step]) -> list[str]:
-    """Added effects in words with their probabilities; what was added twice is said once."""
+    """Added effects in words with their probabilities; repeated effects are named once."""
     added = [(step.added, step.probability) for step in steps if step.added is not None]
     counted = Counter(_placed(e.spoken(), e) for e, _ in added)
     sure = {_placed(e.spoken(), e): odds(share) for e, share in added}
@@ -399,7 +399,7 @@ def _spoken(steps: Sequence[Step]) -> list[str]:
 
 
 def step_name(step: Step) -> str:
-    """What a step added, by name and joint, and the recordings it is on if it is not on all."""
+    """The effect of a step by name and joint, with its recordings if it is not on all."""
     assert step.added is not None
     return _placed(step.added.effect_name(), step.added)
 
@@ -420,7 +420,7 @@ def _errors(step: Step) -> dict[str, list[float]]:
 
 
 def _found_parameters(steps: Sequence[Step], added: int) -> dict[str, dict[str, Any]]:
-    """Values of the added-th added effect in the last fit; added effects stand last in the loop."""
+    """Values of one of the added effects in the last fit; these are the loop's last effects."""
     fit = steps[-1].fit
     total = sum(step.added is not None for step in steps)
     effect = fit.loop.effects[len(fit.loop.effects) - total + added]
@@ -436,9 +436,9 @@ def _found_parameters(steps: Sequence[Step], added: int) -> dict[str, dict[str, 
 
 
 def effect_parameters(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[int, str, str]]:
-    """Where an effect's free values stand in `loop.theta`: place, name in the effect, unit.
+    """Places of an effect's free values in `loop.theta`, with name in the effect and unit.
 
-    **Raises:** `ModelError` where the loop does not have the effect.
+    **Raises:** `ModelError` if the loop does not have the effect.
     """
     position = next((k for k, e in enumerate(loop.effects) if e is effect), None)
     if position is None:

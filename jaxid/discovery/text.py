@@ -1,4 +1,4 @@
-"""A story as text that fits a terminal of 80 columns: errors, what was found, the models."""
+"""A story as text for a terminal of 80 columns: errors, added effects, models."""
 
 import textwrap
 from collections.abc import Sequence
@@ -8,12 +8,12 @@ import numpy as np
 from .models import Model
 
 WIDTH = 80
-# Joints beside each other; columns of a number; models that are listed.
+# Joints per table; characters of a number; number of listed models.
 _JOINTS, _NUMBER, _MODELS = 6, 9, 8
 
 
 def wrapped(text: str) -> list[str]:
-    """A paragraph in lines, all but the first indented."""
+    """A paragraph in lines; all lines except the first are indented."""
     return textwrap.wrap(text, WIDTH, subsequent_indent="  ", break_on_hyphens=False)
 
 
@@ -50,7 +50,7 @@ def errors_table(
 def models_lines(models: Sequence[Model]) -> list[str]:
     """The best models by their row in the table of models, with the starting model.
 
-    Errors are those of the joint that is worst off; `~` marks what was predicted and not fitted.
+    Errors are those of the worst joint; `~` marks predictions.
     """
     numbered = list(enumerate(models))
     shown = [(k, m) for k, m in numbered if k < _MODELS or m.label == "start"]

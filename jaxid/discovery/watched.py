@@ -1,4 +1,4 @@
-"""A search as it is watched: what is tried, the time left, and the error of each model."""
+"""Progress of a search: the current activity, the time left, and the error of each model."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,19 +9,19 @@ from ..display import figures
 from ..display.progress import Pace
 from .models import Model
 
-# What a search is expected to do from its start, and what after the fit of a set: fits, screening
-# of the whole catalogue, a look at sets in the linear system.
+# Expected activities after the fit of a set, and from the start of a search: fits, screening of the
+# whole catalogue, exploration of sets in the linear system.
 ROUND = ("screen", "look")
 _COURSE = ("fit", "screen", "fit", "screen", "look", "fit", *ROUND)
 
 
 class Watched:
-    """Tells what a search does, and draws the error of each model that it has fitted.
+    """Reports the activity of a search, and draws the error of each fitted model.
 
     **Arguments:**
 
-    - `say`: takes a text and `left`, the time left in s.
-    - `draw`: takes what makes a figure.
+    - `say`: function of a text and `left`, the time left in s.
+    - `draw`: function of a function that makes a figure.
     """
 
     def __init__(self, say: Callable[..., None], draw: Callable[[Callable[[], Any]], None]) -> None:
@@ -31,17 +31,17 @@ class Watched:
         self._errors: list[np.ndarray] = []
 
     def begin(self, kind: str, text: str, then: Sequence[str] | None = None) -> None:
-        """Says what begins, and how long all is likely to take from there.
+        """Reports the start of an activity, and the expected time left for the search.
 
         **Arguments:**
 
         - `kind`: `"fit"`, `"screen"` or `"look"`.
-        - `then`: what is expected after it, where that has changed.
+        - `then`: activities expected after it, if these have changed.
         """
         self.say(text, left=self._pace.begin(kind, then))
 
     def fitted(self, model: Model) -> None:
-        """Draws the errors of all models that were fitted, with one more of them."""
+        """Adds a fitted model, and draws the errors of all fitted models."""
         assert model.left is not None
         self._labels.append(model.label)
         self._errors.append(model.left)

@@ -1,7 +1,7 @@
-"""What a fitted model would say with an effect in it, at values that a person moves by hand.
+"""Predictions of a fitted model with an additional effect, at values that the user sets.
 
-The answer is the linear system's (`linear.py`, `predict.py`), in milliseconds: no model with the
-effect in it is compiled or simulated.
+The linear system (`linear.py`, `predict.py`) gives them in milliseconds: no model with the effect
+is compiled or simulated.
 """
 
 from collections.abc import Iterable, Sequence
@@ -30,15 +30,15 @@ from .screening import offered
 from .system import System
 from .verify import Refits
 
-# Amplitudes of this many times what least squares asks for are as large as anyone would try.
+# Range of amplitudes, as a multiple of the least-squares estimate.
 _WIDE = 3.0
 
 
 class Seen(eqx.Module):
-    """Signals of some recordings as they are compared; zero where there is no sample.
+    """Compared signals of some recordings; zero for padding.
 
-    - `time`: s. `measured`, `simulated`: N·m or N (rad or m in an open loop), the model's own.
-    - `there`: which rows are samples that are compared.
+    - `time`: s. `measured`, `simulated`: N·m or N (rad or m in an open loop), by the fitted model.
+    - `there`: rows that are compared samples.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -49,11 +49,11 @@ class Seen(eqx.Module):
 
 
 class Answer(eqx.Module):
-    """What a model would leave with an effect in it.
+    """The predicted residual of a model with an effect.
 
-    - `fitted`, `held_out`: measured less predicted, as in `Seen`; None without such recordings.
+    - `fitted`, `held_out`: measured minus predicted, as in `Seen`; None without such recordings.
     - `fitted_percent`, `held_out_percent`: relative errors by joint, %.
-    - `possible`: whether no amplitude is beyond its bounds, and the loop does not run away.
+    - `possible`: whether all amplitudes are within their bounds, and the loop does not diverge.
     """
 
     effect: AbstractEffect | None
@@ -65,11 +65,11 @@ class Answer(eqx.Module):
 
 
 class WhatIf(eqx.Module):
-    """A fitted model along its recordings and along others, ready for effects to be tried.
+    """A fitted model along its recordings and others, prepared for trials of effects.
 
-    - `settings`: the catalogue's effects that can be asked of the model, at each of their settings.
-    - `absorbed`: how far the model's own values would move without an effect: next to nothing for a
-      fit that converged.
+    - `settings`: the effects of the catalogue that suit the model, at each of their settings.
+    - `absorbed`: change of the model's own values without an effect, almost zero for a converged
+      fit.
     """
 
     fit: Fit
@@ -86,14 +86,14 @@ class WhatIf(eqx.Module):
         validate: Recording | Recordings | Iterable[Recording] | None = None,
         catalogue: Sequence[Any] = known,
     ) -> "WhatIf":
-        """Linearises a fitted model along its recordings, and along those that it has not seen.
+        """Linearises a fitted model along its recordings, and along held-out ones.
 
         **Arguments:**
 
-        - `fit`: of a loop that can be simulated. `validate`: held out of the fit.
+        - `fit`: fit of a loop that can be simulated. `validate`: held-out recordings.
         - `catalogue`: as for `diagnose`.
 
-        **Raises:** `FitError` where the fitted loop cannot be simulated.
+        **Raises:** `FitError` if the fitted loop cannot be simulated.
         """
         system = System.of(fit)
         noise = _weights(fit, system)
@@ -106,7 +106,7 @@ class WhatIf(eqx.Module):
         return cls(fit, comparison, predictor, unseen, settings, absorbed)
 
     def seen(self, held_out: bool = False) -> Seen:
-        """The signals of the fitted recordings, or of those held out."""
+        """The signals of the fitted recordings, or of the held-out ones."""
         predictor = self.unseen if held_out else self.predictor
         of = self.comparison if held_out else self.fit
         assert predictor is not None
@@ -122,18 +122,18 @@ class WhatIf(eqx.Module):
         return Seen(names, time, measured, measured - system.residual, system.mask)
 
     def answer(self, effect: AbstractEffect | None, again: bool = True) -> Answer:
-        """What the model with an effect at these values leaves of its recordings.
+        """Predicted residual of the model with an effect at these values.
 
         **Arguments:**
 
-        - `effect`: not in the loop yet; None for the model as it was fitted.
-        - `again`: whether the model's own parameters are estimated again beside the effect, as a
-          refit would; else they stay as they were fitted.
+        - `effect`: an effect that is not in the loop; None for the fitted model.
+        - `again`: whether the model's own parameters are estimated again with the effect, as in a
+          refit; otherwise they keep their fitted values.
         """
         rest, there = _left(self.predictor, effect)
         taken = np.zeros(self.predictor.base.shape[1])
         if again and effect is not None:
-            # Less what no effect would move, so that an effect of no size changes nothing.
+            # Relative to the change without an effect, so an effect of zero size changes nothing.
             taken = self.predictor.absorbed(rest) - self.absorbed
             rest = _without(self.predictor, rest, taken)
         percent = _percent(self.fit, self.predictor, rest)
@@ -147,11 +147,11 @@ class WhatIf(eqx.Module):
         return Answer(effect, rest, percent, beyond, unseen_percent, there and everywhere)
 
     def best(self, like: AbstractEffect) -> AbstractEffect:
-        """An effect at the values of the least squared error, refined from each of its settings.
+        """An effect at the values of smallest squared error, refined from each of its settings.
 
         **Arguments:**
 
-        - `like`: any of them.
+        - `like`: any of its settings.
         """
         found: list[Prediction] = [
             self.predictor.predict((self.sized(e),)) for e in self.settings_of(like)
@@ -164,7 +164,7 @@ class WhatIf(eqx.Module):
         return tuple(e for e in self.settings if form(e) == form(like))
 
     def sized(self, effect: AbstractEffect) -> AbstractEffect:
-        """The effect at the amplitudes that least squares gives them, inside their bounds."""
+        """The effect at its least-squares amplitudes within their bounds."""
         linear = amplitudes(effect)
         if not linear:
             return effect
@@ -182,16 +182,16 @@ class WhatIf(eqx.Module):
         return write_values(effect, linear, jnp.asarray(values))
 
     def ranges(self, like: AbstractEffect) -> dict[str, tuple[float, float]]:
-        """From where to where each free parameter of an effect is worth moving.
+        """Useful range of each free parameter of an effect.
 
-        Shapes cover the settings that a diagnosis screens, and half as much on either side.
-        Amplitudes cover three times what least squares asks for.
+        Shapes cover the settings that a diagnosis screens, and half of that range on either side.
+        Amplitudes cover three times the least-squares estimate.
         """
         settings = self.settings_of(like)
         middle = settings[len(settings) // 2]
         columns = self.predictor.shown(middle)[..., 1:]
         size = np.linalg.norm(columns.reshape(-1, columns.shape[-1]), axis=0)
-        # What would be as large as all of the residual, and what least squares asks for.
+        # The amplitude as large as the whole residual, and the least-squares estimate.
         whole = np.linalg.norm(self.predictor.data.residual) / np.maximum(size, 1e-300)
         sized = self.sized(middle)
         taken = np.abs(np.asarray(read_values(sized, free_of(sized)))) if len(whole) else whole
@@ -216,16 +216,16 @@ class WhatIf(eqx.Module):
     def refit(self, effect: AbstractEffect) -> Fit:
         """The model with the effect, fitted in full from these values.
 
-        **Raises:** `FitError`, `ModelError` where it cannot be.
+        **Raises:** `FitError`, `ModelError` if it cannot be fitted.
         """
         refits = Refits(self.fit.recordings, oem_of(self.fit))
         return refits.with_effects(self.fit, [effect], self.predictor.noise)
 
 
 def _weights(fit: Fit, system: System) -> tuple[ARFilter, ...]:
-    """The noise filters that a fit had, at the levels that it left; white ones where it had none.
+    """The noise filters of a fit, scaled to its residual; white ones if it has none.
 
-    A fit weights each output by what it leaves of it, whatever level its filters came with.
+    A fit weights each output by its residual, independently of the level of its filters.
     """
     outputs = system.residual.shape[2]
     noise = (ARFilter(np.zeros(0), 1.0),) * outputs
@@ -239,7 +239,7 @@ def _weights(fit: Fit, system: System) -> tuple[ARFilter, ...]:
 
 
 def _left(predictor: Predictor, effect: AbstractEffect | None) -> tuple[np.ndarray, bool]:
-    """What is left beside an effect, and whether the loop does not run away with it."""
+    """The residual with an effect, and whether the loop does not diverge with it."""
     residual = predictor.data.residual
     if effect is None:
         return residual, True
@@ -249,14 +249,14 @@ def _left(predictor: Predictor, effect: AbstractEffect | None) -> tuple[np.ndarr
 
 
 def _without(predictor: Predictor, rest: np.ndarray, taken: np.ndarray) -> np.ndarray:
-    """What is left where the base's values are moved."""
+    """The residual after a change of the base's values."""
     return (rest - predictor.data.base @ taken) * predictor.data.mask[..., None]
 
 
 def _beyond(unseen: Predictor, rest: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """What is left of held-out recordings where the loop's own parameters are moved.
+    """The residual of held-out recordings after a change of the loop's own parameters.
 
-    Initial states, which stand behind these in the base, are those that the recordings ask for.
+    Initial states, which follow these in the base, are estimated from the held-out recordings.
     """
     data = unseen.data
     rest = _without(unseen, rest, np.append(own, np.zeros(data.base.shape[-1] - len(own))))

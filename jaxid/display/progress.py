@@ -31,7 +31,7 @@ class Line:
     def say(self, text: str, share: float | None = None, left: float | None = None) -> None:
         """Sets the current activity, the share that is done, 0 to 1, and the time left, s.
 
-        The time left counts down until it is set again; if the share is given, it follows from it.
+        If the share is given, the time left follows from it. It counts down until it is set again.
         """
         self.text, self.share, now = text, share, time.perf_counter()
         if share:
@@ -121,7 +121,7 @@ def working(title: str, show: bool = True) -> Iterator[Callable[..., None]]:
     if handle is not None:
         yield from _in_notebook(line, handle)
         return
-    # Imported here, since imports take most of the time of a short command.
+    # Imported here, because imports take most of the time of a short command.
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -164,7 +164,7 @@ def _html(line: Line) -> dict[str, str]:
 def live_figure(show: bool = True) -> Callable[[Callable[[], Any]], None]:
     """Gives a function that draws a figure in a notebook; each figure replaces the last one.
 
-    It takes a function that makes the figure and that is not called outside a notebook.
+    It takes a function that makes the figure; outside a notebook, that function is not called.
 
     **Arguments:**
 
@@ -187,7 +187,7 @@ def live_figure(show: bool = True) -> Callable[[Callable[[], Any]], None]:
 
 def in_notebook() -> bool:
     """Whether this process is the kernel of a notebook."""
-    # A process that is not run by IPython does not import it.
+    # IPython is already imported in a process that it runs.
     if "IPython" not in sys.modules:
         return False
     from IPython.core.getipython import get_ipython  # type: ignore[import-not-found]

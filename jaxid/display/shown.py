@@ -21,11 +21,11 @@ class AbstractShown(eqx.Module):
         """The table, as HTML."""
 
     def _ipython_display_(self) -> None:
-        # Only IPython calls this method, so it is installed.
+        # Only IPython calls this method, so IPython is installed.
         from IPython.core.getipython import get_ipython  # type: ignore[import-not-found]
         from IPython.display import display  # type: ignore[import-not-found]
 
         display({"text/html": self._repr_html_(), "text/plain": repr(self)}, raw=True)
-        # On a terminal a figure would open a browser, which is not wanted here.
+        # A terminal would open a browser for the figure.
         if hasattr(get_ipython(), "kernel"):
             display(self.plot())

@@ -1,4 +1,4 @@
-"""Physical effects, one family a file, and the catalogue."""
+"""Physical effects, one family per file, and the catalogue."""
 
 from ._base import NOBODY as NOBODY
 from ._base import AbstractEffect as AbstractEffect

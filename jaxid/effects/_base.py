@@ -35,13 +35,13 @@ def recording_label(name: str) -> int:
 class Motion(eqx.Module):
     """State of the arm at one instant, the input of an effect; every vector is `(joints,)`.
 
-    `t` in s; `q`, `v`, `a` in rad or m and their derivatives; `tau` is the torque that the
+    `t` is in s; `q`, `v`, `a` are in rad or m and their derivatives; `tau` is the torque that the
     drives deliver, N·m or N. `a` is zero unless the effect is `inertial` or `needs_acceleration`.
     For a `loaded` effect, `tau` is the torque that reaches the links after all other effects on
-    the drives. `state` holds the effect's own states. `label` identifies the recording
-    (`recording_label`). `held` are signals of the recording
-    that hold from sample to sample, by their names there (`on`, `supply`). For a `loaded` effect,
-    `load` is the torque that the links take without accelerating; None for others.
+    the drives, and `load` is the torque that the links need without accelerating (None for other
+    effects). `state` contains the effect's own states. `label` identifies the recording
+    (`recording_label`). `held` has the recording's signals that are constant from sample to
+    sample, by name (`on`, `supply`).
     """
 
     t: Float[Array, ""]
@@ -64,7 +64,7 @@ class AbstractEffect(eqx.Module):
     Class attributes, all False by default:
 
     - `inertial`: `torque` depends on acceleration and is affine in it.
-    - `needs_acceleration`: `torque` depends on acceleration in another way; it gets the
+    - `needs_acceleration`: `torque` depends on acceleration in another way; `a` is then the
       acceleration of the arm without the effect.
     - `loaded`: `torque` depends on the torque that reaches the link.
     - `finite`: it has no derivative at zero amplitude, or one that does not predict its effect, so
@@ -183,11 +183,11 @@ class AbstractTransmission(AbstractEffect):
 
 
 def check_declared(effect: AbstractEffect, joints: int) -> None:
-    """Raises `ModelError` where a torque uses an acceleration that it does not get.
+    """Raises `ModelError` if a torque uses an acceleration that it does not get.
 
     **Arguments:**
 
-    - `effect`: any. `joints`: of the arm that it is on.
+    - `effect`: any effect. `joints`: number of joints of its arm.
     """
     if effect.inertial or effect.needs_acceleration:
         return

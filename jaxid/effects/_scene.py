@@ -11,16 +11,17 @@ class Scene(eqx.Module):
     """Ranges of the recorded motion, one value for each joint, in SI units.
 
     - `q_low`, `q_high`: range of position. `speed`, `torque`: largest magnitudes.
-    - `inertia`: mean inertia of a joint while the others are free. `smoothing`: of the sign in its
-      Coulomb friction.
+    - `inertia`: mean inertia of a joint while the others are free. `smoothing`: smoothing of the
+      sign in its Coulomb friction.
     - `period`, `duration`: of the recordings, s. `recordings`: their names.
     - `tones`: frequencies of peaks in the residual's spectrum, Hz.
-    - `lengths`: of the links before the last, m; `g`: gravity in their plane, m/s².
+    - `lengths`: lengths of the links before the last, m; `g`: gravity in their plane, m/s².
     - `slides`: whether a joint slides. `planar`: whether links move in one plane.
-    - `couplings`: pairs of joints that may share a shaft, and its turns for one of the first joint.
-    - `moments`: first moments of each link in its own frame, kg·m; None where not known.
-    - `space`: joints and bodies of an arm in space; None of others.
-    - `drawn`: whether its bodies are held at what a drawing says.
+    - `couplings`: pairs of joints that may share a shaft, and the turns of the shaft per turn of
+      the first joint.
+    - `moments`: first moments of each link in its own frame, kg·m; None if not known.
+    - `space`: joints and bodies of an arm in space; None for other arms.
+    - `drawn`: whether its bodies are held at the values of a drawing.
     """
 
     q_low: Float[np.ndarray, " joints"]

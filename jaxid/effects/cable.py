@@ -15,7 +15,7 @@ class CableDrag(AbstractEffect):
     """A bundle of cables past two joints, which couples them elastically.
 
     It is clamped before joint i and behind joint j, and bends with both. To second order in the
-    angles its elastic energy has a term k q_i q_j + t_i q_i + t_j q_j, so that the coupling is
+    angles its elastic energy has a term k q_i q_j + t_i q_i + t_j q_j, so the coupling is
     symmetric in i and j. Its effect on each joint alone is a `Spring`.
 
     **Arguments:**

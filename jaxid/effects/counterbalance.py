@@ -21,7 +21,7 @@ class Counterbalance(AbstractEffect):
 
     **Arguments:**
 
-    - `joint`: on which it acts.
+    - `joint`: the joint on which it acts.
     - `level`: force times the shorter distance, N·m. `angle`: qc, rad. `ratio`: r, below one.
     """
 
@@ -38,7 +38,7 @@ class Counterbalance(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Counterbalance"]:
-        """Turning joints of an arm in space; angles over half a turn, since the sign is free."""
+        """Turning joints of an arm in space; angles over half a turn, because the sign is free."""
         if scene.planar:
             return []
         angles = np.arange(8) * np.pi / 8 - np.pi / 2

@@ -22,7 +22,7 @@ class SharedShaft(AbstractEffect):
     **Arguments:**
 
     - `joint`: the one that the shaft passes, i. `driven`: the one that it drives, j.
-    - `share`: turns of the shaft for one of joint i, in turns for one of joint j.
+    - `share`: turns of the shaft per turn of joint i, divided by those per turn of joint j.
     """
 
     joint_fields = ("joint", "driven")

@@ -19,8 +19,8 @@ class Curve(AbstractEffect):
 
     A cubic B-spline on even knots between `low` and `high`, constant beyond them.
 
-    - `joint`: on which the torque acts. `coordinate`: position `"q"`, velocity `"v"`,
-      acceleration `"a"`, torque `"tau"` (of `of`) or time `"t"`.
+    - `joint`: the joint on which the torque acts. `coordinate`: position `"q"`, velocity `"v"`,
+      acceleration `"a"` or torque `"tau"` of joint `of`, or time `"t"`.
     - `signed`: whether to multiply by the sign of this joint's velocity, as for friction.
     """
 
@@ -37,12 +37,12 @@ class Curve(AbstractEffect):
 
     @property
     def label(self) -> str:
-        """The coordinate with its joint, as `v2`; time alone."""
+        """The coordinate with its joint, such as `v2`; `t` for time."""
         return "t" if self.coordinate == "t" else f"{self.coordinate}{self.of}"
 
     @property
     def spoken_coordinate(self) -> str:
-        """The coordinate in words, as `velocity of joint 2`."""
+        """The coordinate in words, such as `velocity of joint 2`."""
         words = {"q": "position", "v": "velocity", "a": "acceleration", "tau": "drive torque"}
         return "time" if self.coordinate == "t" else f"{words[self.coordinate]} of joint {self.of}"
 

@@ -47,7 +47,7 @@ class ActuatorLag(AbstractEffect):
         return jnp.zeros(1)
 
     def settled(self, motion: Motion) -> Float[Array, " states"]:
-        """The first command, as if it had been there before, `(1,)`."""
+        """The equilibrium at the first command, `(1,)`."""
         return motion.tau[self.joint - 1][None]
 
     def derivative(self, motion: Motion) -> Float[Array, " states"]:
@@ -87,13 +87,13 @@ class TimeDelay(AbstractEffect):
         return jnp.zeros(5)
 
     def settled(self, motion: Motion) -> Float[Array, " states"]:
-        """The first command, as if it had been there before, `(5,)`."""
+        """The equilibrium at the first command, `(5,)`."""
         return jnp.zeros(5).at[0].set(motion.tau[self.joint - 1])
 
     def derivative(self, motion: Motion) -> Float[Array, " states"]:
         """Rate of a low-passed command and its derivatives in units of delay / 7, `(5,)`."""
         late, slopes = motion.state[0], motion.state[1:]
-        # The poles are all about 7 from zero: in such units no state is large.
+        # The magnitude of all poles is about 7; in these units no state is large.
         below = jnp.array([8400 / 7**4, 2100 / 7**3, 300 / 7**2, 25 / 7])
         last = 15120 / 7**5 * (motion.tau[self.joint - 1] - late) - below @ slopes
         pace = 7 / jnp.where(self.delay > 0, self.delay, 1.0)

@@ -15,16 +15,17 @@ from .friction import smoothing_speed
 class GearFriction(AbstractEffect):
     """Load-dependent friction: (|Km tau + Ke load| + S (Fs + |Kms tau + Kes load|)) sigma(v).
 
-    S = exp(-|v/vs|^power), tau is the torque of the drive less other friction, and load is the
-    torque that the links need without accelerating, gravity for instance (Duclusaud, Passault,
-    Padois, Ly 2025, whose tau_e is -load). Unlike `LoadDependentFriction`, it also acts in a gear
-    that is driven back by its load while the drive gives no torque.
+    S = exp(-|v/vs|^power), tau is the torque of the drive minus other friction, and load is the
+    torque that the links need without accelerating, such as gravity (Duclusaud, Passault, Padois,
+    Ly 2025, whose tau_e is -load). Unlike `LoadDependentFriction`, it also acts if the load drives
+    the gear back while the drive gives no torque.
 
     **Fields:**
 
     - `drive`, `back`: Km and Ke; `back` is None if one ratio holds for both.
     - `slow`, `slow_back`, `level`: Kms, Kes (None for Kms) and Fs.
-    - `velocity`, `power`: of S; `velocity` None for friction without S, whose fields are not used.
+    - `velocity`, `power`: vs and the power in S. If `velocity` is None, there is no S, and its
+      fields are not used.
     """
 
     joint_fields = ("joint",)

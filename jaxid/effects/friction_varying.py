@@ -43,8 +43,8 @@ class LoadDependentFriction(AbstractEffect):
 class PositionDependentFriction(AbstractEffect):
     """Friction that varies with the angle, once and twice a turn (bent shafts, worn gears).
 
-    (A1 cos q + B1 sin q + A2 cos 2q + B2 sin 2q) sigma(v). For a sliding joint its travel is
-    half a turn, so that friction may rise from one end to the other.
+    (A1 cos q + B1 sin q + A2 cos 2q + B2 sin 2q) sigma(v). For a sliding joint the travel counts
+    as half a turn, so friction may rise from one end to the other.
     """
 
     joint_fields = ("joint",)
@@ -77,7 +77,7 @@ class PositionDependentFriction(AbstractEffect):
         return on_joint(self.joint, wave * smooth_sign(motion.v[j], self.smoothing), motion)
 
 
-# A lubricant takes minutes to warm. What fades within a second, s, is something else.
+# A lubricant takes minutes to warm. Torque that fades within a second, s, has another cause.
 _FASTEST = 1.0
 
 
@@ -163,7 +163,7 @@ class LuGre(AbstractEffect):
 
     @classmethod
     def effect_name(cls) -> str:
-        """`hysteresis`, of which it is one form."""
+        """`hysteresis`: this is one of its forms."""
         return "hysteresis"
 
     @classmethod

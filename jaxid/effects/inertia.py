@@ -22,7 +22,7 @@ class RotorInertia(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["RotorInertia"]:
-        """Joints from 2 on: that of the first is part of its base inertia, unless that is held."""
+        """Joints from 2 on, as joint 1's rotor is part of its base inertia; all if that is held."""
         return [cls(joint=j) for j in scene.joints if j > 1 or scene.drawn]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
@@ -33,9 +33,9 @@ class RotorInertia(AbstractEffect):
 class Payload(AbstractEffect):
     """A point mass on the last link, on all or on named recordings.
 
-    `lengths` are those of the links before the last (m), `reach` the mass's distance along the
-    last, `g` gravity in the plane with angles from hanging down (m/s²). On a sliding joint it is
-    a mass on the carriage.
+    `lengths` are those of the links before the last (m), `reach` is the mass's distance along the
+    last link, `g` is gravity in the plane, with angles from hanging down (m/s²). On a sliding joint
+    it is a mass on the carriage.
     """
 
     mass: Scalar = parameter(0.0, symbol="payload", unit="kg", lower=0.0, scale=0.1)

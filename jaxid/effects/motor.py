@@ -11,12 +11,12 @@ from ._base import AbstractEffect, Motion
 class DCMotor(AbstractEffect):
     """Torque kt i of a commanded voltage u, with the current i = (u - kt v) / R, at most `limit`.
 
-    The joint's command, and the recorded torque of that joint, is then a voltage. All quantities
+    The joint's command and the recorded torque of that joint are then voltages. All quantities
     refer to the joint: a motor of torque constant k behind a gear of ratio n has kt = n k. While
-    the recording says that the drive is off (`on`), no current flows and nothing brakes.
+    the drive is off (`on` in the recording), no current flows and the motor does not brake.
 
-    If the voltage of a recording is never off, R and viscous friction cannot be told apart, except
-    while the current is at its limit.
+    If the voltage is never off in a recording, R and viscous friction cannot be distinguished,
+    except while the current is at its limit.
     """
 
     joint_fields = ("joint",)

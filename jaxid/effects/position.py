@@ -129,8 +129,8 @@ class Tilt(AbstractEffect):
 
     Each link of moments (MX, MY) and angle phi in the plane adds
     gx (MX sin phi + MY cos phi) - gy (MX cos phi - MY sin phi) to its own joint and all
-    previous ones; the first link's moment is along the link. A form of `Gravity` with one parameter
-    less.
+    previous ones; the first link's moment is along the link. This is a form of `Gravity` with one
+    parameter fewer.
     """
 
     gx: Scalar = parameter(0.0, symbol="gx", unit="m/s²", scale=0.1)
@@ -141,7 +141,7 @@ class Tilt(AbstractEffect):
 
     @classmethod
     def effect_name(cls) -> str:
-        """`gravity`, of which it is one form."""
+        """`gravity`: this is one of its forms."""
         return "gravity"
 
     @classmethod

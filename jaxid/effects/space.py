@@ -20,30 +20,30 @@ MASS = BODY.index("M")
 class BaseTilt(AbstractEffect):
     """A base that is not level: gravity is tilted from its direction in the model.
 
-    Its magnitude is known, so two slopes determine it: its direction is g + |g| (x e1 + y e2), with
-    e1 and e2 perpendicular to g. For a base modelled upright, e1 is its x axis and e2 its y axis.
-    The weight of each link loads the joints before it by its mass and first moment (Khalil, Dombre
-    2002).
+    The magnitude of gravity is known, so two slopes determine it: its direction is
+    g + |g| (x e1 + y e2), with e1 and e2 perpendicular to g. For a base modelled upright, e1 is its
+    x axis and e2 its y axis. The weight of each link loads the joints before it by its mass and
+    first moment (Khalil, Dombre 2002).
 
     **Arguments:**
 
     - `chain`: joints of the arm, with gravity as modelled.
-    - `bodies`: `BODY` of each link, SI units, `(joints, 10)`. They are not estimated: if the arm's
-      base parameters are, the links here keep the values they had when the effect was made.
+    - `bodies`: `BODY` of each link, SI units, `(joints, 10)`. They are not estimated, even if the
+      arm's base parameters are: they keep the values of the time at which the effect was made.
     - `x`, `y`: tangents of the angles by which gravity is tilted; None for one that affects no
       torque.
     """
 
     chain: Chain = eqx.field(metadata=KNOWN)
     bodies: Float[Array, "joints 10"] = eqx.field(converter=as_float64)
-    # Torque is linear in them up to terms of second order in the angle.
+    # Torque is linear in the slopes up to terms of second order in the angle.
     x: Scalar | None = parameter(0.0, symbol="tiltx", unit="1", scale=0.02)
     y: Scalar | None = parameter(0.0, symbol="tilty", unit="1", scale=0.02)
     on_link = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["BaseTilt"]:
-        """One, for arms in space that gravity loads, with the slopes that affect their torque."""
+        """One instance for arms in space under gravity, with the slopes that affect torque."""
         if scene.space is None or not np.any(scene.space.chain.gravity):
             return []
         made = cls(scene.space.chain, scene.space.bodies)
@@ -119,12 +119,12 @@ class CarriedBody(AbstractEffect):
 
     @classmethod
     def effect_name(cls) -> str:
-        """The name of a payload, of which this is the form for arms in space."""
+        """The name of a payload; this is its form for arms in space."""
         return "payload"
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["CarriedBody"]:
-        """Each of several recordings in turn, and all together if the last link is held."""
+        """On each of several recordings in turn, and on all if the last link is held."""
         if scene.space is None or MASS not in scene.space.carried:
             return []
         named = [(name,) for name in scene.recordings] if len(scene.recordings) > 1 else []

@@ -91,7 +91,7 @@ class Backlash(AbstractTransmission):
         return dataclasses.replace(self, gap=self.gap * factor)
 
     def after(self, other: AbstractTransmission, load: float) -> "Backlash | None":
-        """A contact with the stiffness of an elasticity, and a gap of its twist to both sides.
+        """A contact as stiff as the elasticity, with a gap of its twist under load on both sides.
 
         A refit does not converge from a contact that is much too stiff.
         """

@@ -23,16 +23,16 @@ Kernels = Callable[[Float[np.ndarray, "samples columns"]], Float[np.ndarray, "3 
 
 
 class Stationary(eqx.Module):
-    """Errors of q, v, a in the rows: correlations by lag in rows, for white errors of variance 1.
+    """Correlations of the errors of q, v, a between rows, for white position errors of variance 1.
 
-    `by_lag[m, k, l]` is that of signal k at a row with signal l `m` rows earlier.
+    `by_lag[m, k, l]` is the correlation of signal k at a row with signal l `m` rows earlier.
     """
 
     by_lag: Float[np.ndarray, "lags 3 3"]
 
 
 class LowRank(eqx.Module):
-    """Errors of q, v, a in the rows as so many independent ones times these: a series' errors."""
+    """Errors of q, v, a in the rows as `factor` times independent errors, for a Fourier series."""
 
     factor: Float[np.ndarray, "3 rows coefficients"]
 
@@ -40,19 +40,19 @@ class LowRank(eqx.Module):
 def errors_of(
     recording: Recording, states: AbstractStates, kernels: Kernels, rows: slice, factor: int
 ) -> Stationary | LowRank:
-    """Covariance in the rows of a regression from white errors of the recorded position.
+    """Covariance of the rows of a regression due to white errors of the recorded position.
 
     **Arguments:**
 
     - `states`: how velocities were estimated. `kernels`: impulse responses from position to the
       rows, through the states and the regression's filter.
-    - `rows`: which samples the rows are. `factor`: samples from one row to the next.
+    - `rows`: the samples of the rows. `factor`: number of samples between rows.
     """
     import scipy
 
     if isinstance(states, FourierStates):
         basis = states.basis(recording)[0]
-        # Columns of unit length and orthogonal: errors of their amplitudes are white again.
+        # Orthonormal columns: the errors of their amplitudes are white again.
         orthogonal, _ = np.linalg.qr(basis)
         return LowRank(kernels(orthogonal)[:, rows])
     memory = states.memory(recording)
@@ -100,15 +100,15 @@ def row_errors(
 ) -> RowErrors:
     """Whitening of one recording's rows: encoder errors plus other white errors.
 
-    To first order the error of a row is that of position, velocity and acceleration times the
-    torque's derivatives there. The rest of the residual is treated as white, with one
-    variance for each joint.
+    To first order the error of a row is the error of position, velocity and acceleration times the
+    torque's derivatives. The other part of the residual is assumed to be white, with one variance
+    for each joint.
 
     **Arguments:**
 
-    - `loop`: at values near the estimate. `at`: the motion at the rows.
+    - `loop`: the loop at values near the estimate. `at`: the motion at the rows.
     - `resolution`: encoder step Q, `(joints,)`; the variance of an error is Q²/12 (Appendix C).
-    - `residual`: of a first estimate.
+    - `residual`: residual of a first estimate.
     """
     sensitivity = np.asarray(_sensitivities(loop, at)) * (resolution / np.sqrt(12))
     rows, joints = residual.shape
@@ -201,8 +201,8 @@ def solve_weighted(
 
     **Arguments:**
 
-    - `columns`, `rights`: of each recording. `nuisances`: columns that every joint's rows may
-      hold besides, in an amount of their own; None for none.
+    - `columns`, `rights`: of each recording. `nuisances`: further columns, each with a free
+      amplitude for every joint; None for none.
     - `errors`: whitening of each recording's rows.
     - `names`, `scales`: of the parameters.
     """

@@ -34,7 +34,7 @@ def fit(
     - `recordings`: one or several of the same robot.
     - `method`: `OEM()` by default.
 
-    **Raises:** `FitError`, `RecordingError` or `ModelError` where the three do not fit together.
+    **Raises:** `FitError`, `RecordingError` or `ModelError` if the three do not match.
     """
     recordings = Recordings.of(recordings)
     check_joints(loop, recordings[0])
@@ -57,22 +57,22 @@ def fit(
 
 
 def _check_rigid(loop: ClosedLoop, method: AbstractMethod) -> None:
-    """Refuses effects because of which sensors do not show the motion that a method needs."""
+    """Raises `FitError` for a method that needs the true motion if an effect hides it."""
     for effect in loop.effects:
         sensor = type(effect).read is not AbstractEffect.read
         if sensor or isinstance(effect, AbstractTransmission):
             raise FitError(
-                f"{type(method).__name__} assumes that the sensors show the motion of drive and "
-                f"link, which differ with {effect.effect_name()}: use OEM, or leave it out"
+                f"{type(method).__name__} assumes that the sensors measure the motion of drive and "
+                f"link, which {effect.effect_name()} changes: use OEM, or leave the effect out"
             )
 
 
-# Probability that the estimate of physical bodies is so far from all of them.
+# The note needs a distance to physical bodies that has at most this probability by chance.
 _CHANCE = 0.01
 
 
 def _matter(found: Fit) -> list[str]:
-    """A note where the base parameters of a serial arm belong to no physical bodies.
+    """A note if the base parameters of a serial arm do not belong to physical bodies.
 
     Needs the extra `sdp`; without it only the mass matrix is checked.
     """
@@ -96,14 +96,14 @@ def _matter(found: Fit) -> list[str]:
     moved = np.abs(nearest.base - np.asarray(arm.base)) / np.sqrt(np.diag(covariance))
     worst = names[0][int(np.argmax(moved))]
     return [
-        f"no bodies of positive mass have these base parameters: the nearest that do are "
-        f"{nearest.distance:.3g} standard deviations away, most of all in {worst}, so an effect "
-        'that the model lacks may be hidden in them; bodies="drawn" makes it visible'
+        f"no physical bodies have these base parameters: the nearest ones are "
+        f"{nearest.distance:.3g} standard deviations away, mostly in {worst}, so the parameters "
+        'may have absorbed an effect that the model lacks; bodies="drawn" makes it visible'
     ]
 
 
 def _band(loop: ClosedLoop, recordings: Recordings) -> list[str]:
-    """A note where torque is compared below a frequency only."""
+    """A note if torque is compared only below a frequency."""
     cutoff = loop.controller.comparable(recordings[0])
     if cutoff is None:
         return []
@@ -113,17 +113,17 @@ def _band(loop: ClosedLoop, recordings: Recordings) -> list[str]:
 def _gaps(recordings: Recordings) -> list[str]:
     """Notes on recordings with gaps."""
     return [
-        f"{r.name} has a gap of {np.diff(r.time).max():.3g} s, across which its reference is "
-        "assumed smooth and its noise stationary: cut it there with Recording.slice"
+        f"{r.name} has a gap of {np.diff(r.time).max():.3g} s; its reference is assumed to be "
+        "smooth across it, and its noise stationary: cut it there by Recording.slice"
         for r in recordings
         if missing_after(r.time).any()
     ]
 
 
 def _honest(found: Fit) -> Fit:
-    """The fit, marked as failed if a number in it is NaN.
+    """The fit, marked as failed if it contains NaN.
 
-    Infinite deviations are allowed: they belong to undetermined parameters.
+    Infinite deviations are allowed for undetermined parameters.
     """
     numbers = {
         "values": np.where(np.isfinite(found.theta), found.theta, np.nan),
@@ -134,18 +134,18 @@ def _honest(found: Fit) -> Fit:
     wrong = [name for name, values in numbers.items() if np.isnan(values).any()]
     if not (wrong and found.succeeded):
         return found
-    note = f"not a number: some of the {' and '.join(wrong)}"
+    note = f"some of the {' and '.join(wrong)} are not numbers (NaN)"
     return dataclasses.replace(found, status=Status.overflowed, notes=(*found.notes, note))
 
 
-# Good models leave a few per cent, and noise is rarely above ten.
+# Good models have an error of a few per cent, and noise is rarely above ten.
 _DOUBTFUL_PERCENT = 30.0
 
 
 def _doubted(found: Fit) -> Fit:
-    """The fit, with a note where it leaves more of a signal than a good model.
+    """The fit, with a note if its relative error is larger than that of a good model.
 
-    It is a misfit if no signal is explained, or if one is larger after the fit than before.
+    The fit is a misfit if it explains no signal, or if a residual is larger than its signal.
     """
     errors = found.error_percent * _of_motion(found)
     left = _left_percent(found, errors)
@@ -159,8 +159,8 @@ def _doubted(found: Fit) -> Fit:
         return found
     joints = ", ".join(f"{label} {value:.3g} %" for label, value in worst.items())
     note = (
-        f"the model does not describe these recordings ({joints} of the signal is left): check "
-        "units, signs, the control law and its gains, and whether there is more motion than noise"
+        f"the model does not describe these recordings (relative error: {joints}): check units, "
+        "signs, the control law and its gains, and whether the motion is larger than the noise"
     )
     return dataclasses.replace(found, notes=(*found.notes, note))
 
@@ -185,9 +185,9 @@ def _followed(found: Fit) -> Fit:
 
 
 def _of_motion(found: Fit) -> Float[np.ndarray, "recordings joints"]:
-    """Norm of the compared signal over the norm of its variation, which a model has to explain.
+    """Norm of the compared signal over the norm of its variation, which the model must explain.
 
-    The mean position does not count, except for joints that barely move.
+    The mean of a position is subtracted, except for joints that barely move.
     """
     shape = found.error_percent.shape
     if found.optimum is None or found.optimum.problem.signals[0] != "q":

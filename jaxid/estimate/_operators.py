@@ -15,7 +15,7 @@ class Operator(eqx.Module):
 
     **Arguments:**
 
-    - `poles`: λ of each, 1/s. `step`: s.
+    - `poles`: λ of each, 1/s. `step`: sample period, s.
     """
 
     poles: tuple[float, ...] = eqx.field(static=True)
@@ -54,9 +54,9 @@ class Operator(eqx.Module):
         **Arguments:**
 
         - `k`: at most the number of poles.
-        - `x`: samples, joined by a cubic spline: joined by lines, what is differentiated and what
-          is not would be off by different shares, of the size of (λ step)².
-        - `held`: True where each sample holds until the next instead.
+        - `x`: samples, interpolated by a cubic spline. Linear interpolation would cause errors of
+          relative size (λ step)² that differ between differentiated and other terms.
+        - `held`: True if each sample is constant until the next instead.
         """
         import scipy
 
@@ -67,7 +67,7 @@ class Operator(eqx.Module):
             spline = scipy.interpolate.CubicSpline(self.step * np.arange(len(flat)), flat)
             pieces = spline.c[::-1] * np.array([1.0, 1.0, 2.0, 6.0])[:, None, None]
         stages = self._stages(pieces, flat[0])
-        # A stage is y' = λ (u - y), with the one before as u.
+        # A stage is y' = λ (u - y), where u is the output of the stage before.
         chain = [flat, *stages]
         for _ in range(k):
             poles = self.poles[-len(chain) + 1 :]
@@ -78,7 +78,7 @@ class Operator(eqx.Module):
     def _stages(
         self, pieces: Float[np.ndarray, "4 pieces columns"], start: Float[np.ndarray, " columns"]
     ) -> list[Float[np.ndarray, "samples columns"]]:
-        """Outputs of the first-order low-passes in a row, at the samples."""
+        """Outputs of the chain of first-order low-passes, at the samples."""
         import scipy
 
         n = len(self.poles)
@@ -104,7 +104,7 @@ class Operator(eqx.Module):
         t = time - time[0]
         columns, seen = [], []
         for pole in self.poles:
-            # Nearly equal poles span the same space as one pole and its derivative.
+            # The responses of nearly equal poles are replaced by one response and its derivative.
             same = sum(abs(pole - other) < 1e-3 * pole for other in seen)
             columns.append((pole * t) ** same * np.exp(-pole * t))
             seen.append(pole)
@@ -117,5 +117,5 @@ class Operator(eqx.Module):
 
     @property
     def factor(self) -> int:
-        """Decimation that keeps the pass band: four samples for each period of the fastest pole."""
+        """Decimation that keeps the pass band: four samples per period of the fastest pole."""
         return max(1, int(2 * np.pi / max(self.poles) / self.step / 4))

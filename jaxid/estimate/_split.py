@@ -34,9 +34,8 @@ EncoderWeights = Literal["joint", "encoder"]
 class Rows(eqx.Module):
     """The regression of one recording: equations and data for their weights.
 
-    `states` say where its motion came from. `transient` holds columns that each joint's rows may
-    contain besides, or None; `kernels` is what recorded positions become on their way into the
-    rows, which are the samples `at`.
+    `states`: source of the motion. `transient`: further columns of each joint's rows, or None.
+    `kernels`: impulse responses from recorded positions to the rows. `at`: samples of the rows.
     """
 
     columns: Float[np.ndarray, "rows joints parameters"]
@@ -49,7 +48,7 @@ class Rows(eqx.Module):
 
 
 def as_motion(motion: Simulated, recording: Recording) -> Motion:
-    """A motion as effects see it, `(samples,)` before every axis."""
+    """A motion in the form that effects need, `(samples,)` before every axis."""
     n = motion.q.shape[0]
     label = jnp.full(n, recording_label(recording.name))
     signals = (motion.time, motion.q, motion.v, motion.a, motion.tau)
@@ -61,8 +60,8 @@ def as_motion(motion: Simulated, recording: Recording) -> Motion:
 def split_torque(loop: ClosedLoop, at: Motion, once: bool) -> Float[Array, "4 samples joints"]:
     """Inverse dynamics minus delivered torque, in parts that need no acceleration.
 
-    The parts are to be differentiated twice, once and not at all; the last is the torque that is
-    delivered, with its sign. `once` moves the first part to the second, as its rate.
+    The first part is to be differentiated twice, the second once, the third not at all; the last is
+    the delivered torque, with its sign. `once` adds the rate of the first part to the second.
     """
     parameters = list_parameters(loop.arm)
     values = read_values(loop.arm, parameters)
@@ -107,7 +106,7 @@ def _check_effects(loop: ClosedLoop, method: AbstractMethod) -> None:
         if effect.inertial or effect.needs_acceleration or isinstance(effect, AbstractTransmission):
             raise FitError(
                 f"{effect.effect_name()} needs an acceleration, which {type(method).__name__} does "
-                "not have: use IDIM or OEM, or leave it out"
+                "not have: use IDIM or OEM, or leave the effect out"
             )
 
 
@@ -123,11 +122,11 @@ def split_rows(
 
     **Arguments:**
 
-    - `method`: whose name errors give.
-    - `states`: where velocities come from. `operator`: with one pole or two.
+    - `method`: named in errors.
+    - `states`: source of velocities. `operator`: with one or two poles.
     - `transient`: how the operator's unknown initial state is treated.
 
-    **Raises:** `FitError` where an effect needs an acceleration, or no rows are left.
+    **Raises:** `FitError` if an effect needs an acceleration, or no rows are left.
     """
     _check_effects(loop, method)
     states = states.resolved(recording)
@@ -152,7 +151,7 @@ def split_rows(
     picked = passed[at]
     if picked.shape[0] * picked.shape[1] <= picked.shape[2] + 2 * loop.joints:
         raise FitError(
-            f"{recording.name} leaves {picked.shape[0]} rows after its filter, too few for "
+            f"{recording.name} has {picked.shape[0]} rows after its filter, too few for "
             f"{picked.shape[2] - 1} parameters: raise the poles, or record longer"
         )
 
@@ -203,11 +202,11 @@ def fit_rows(
 
     **Arguments:**
 
-    - `method`: as results show it.
+    - `method`: as shown by results.
     - `weights`: `"joint"`, or `"encoder"` for the covariance that follows from the resolution.
     - `rows_of`: gives the rows of a recording.
 
-    **Raises:** `FitError` where the resolution is not known, or the rows are too few.
+    **Raises:** `FitError` if the resolution is not known, or the rows are too few.
     """
     started = time.perf_counter()
     if weights == "encoder":
@@ -217,7 +216,7 @@ def fit_rows(
                     f"{recording.name} has no encoder resolution: give resolution= "
                     "when it is read, or use weights='joint'"
                 )
-    # Operators, differences and series are those of even samples.
+    # Operators, differences and series need even samples.
     even = Recordings.of([evened(recording) for recording in recordings])
     rows = [rows_of(recording) for recording in even]
     chosen = linear_parameters(loop)
@@ -242,7 +241,7 @@ def fit_rows(
 
 
 def _coloured(stacked: Stacked, solved: Solved, names: tuple[str, ...]) -> Solved:
-    """The same solution with deviations that allow for coloured residuals."""
+    """The same solution, with deviations that allow for coloured residuals."""
     spread = np.sqrt(np.mean(solved.residual**2, axis=0))
     spread = np.where(spread > 0, spread, 1.0)
     residuals = stacked.split(solved.residual / spread)

@@ -32,7 +32,7 @@ from .result import Status
 
 
 class Converged(eqx.Module):
-    """A converged (or not) minimisation, with what is needed to report it."""
+    """A minimisation, converged or not, with the data for its report."""
 
     loop: ClosedLoop
     pieces: tuple[Recording, ...]
@@ -64,10 +64,10 @@ def converge(
 
     **Arguments:**
 
-    - `filters`: noise filter of each output; white noise where None.
-    - `deadline`: of `time.perf_counter`; after it the best values so far are returned.
-    - `weights`: start values, if known; filters contain theirs.
-    - `batch`: the pieces prepared, if they are already.
+    - `filters`: noise filter of each output; white noise if None.
+    - `deadline`: time of `time.perf_counter` after which the best values so far are returned.
+    - `weights`: start values, if known; filters have their own.
+    - `batch`: the prepared pieces, if they exist.
     """
     pieces = pieces_of(recordings, method.window)
     signals = compared_signals(method, loop)
@@ -83,7 +83,7 @@ def converge(
     bounds = Bounds.of(loop.free_parameters)
     if weights is None and filters is not None:
         weights = _weights_of(filters, first)
-    # The weight of a single output only scales the loss.
+    # For a single output the weight only scales the loss.
     alone = len(first) == 1
     # Until the weights are known, a rough minimum is enough.
     worth = 1e-4 if alone or weights is not None else 1e-2
@@ -107,7 +107,7 @@ def converge(
             break
         loop, start = loop.with_theta(minimum.point.theta), minimum.point.start
         new = _new_weights(minimum.point, problem, first)
-        # Estimates depend little on the weights: an error of 10 % costs 0.5 % of precision.
+        # Estimates depend little on the weights: an error of 10 % raises deviations by 0.5 %.
         floor = bool(np.all(np.asarray(new) > 0.99 / _FLOOR * np.asarray(first)))
         if minimum.status is Status.stalled and floor:
             # The residual is at rounding level, and no step lowers it.
@@ -136,7 +136,7 @@ def converge(
 
 
 def _weights_of(filters: Noise, first: Float[Array, " outputs"]) -> Float[Array, " outputs"]:
-    """Inverse deviation of each filter's innovations, with a floor relative to the signal."""
+    """Inverse deviation of each filter's innovations; deviations have a floor by the signal."""
     if isinstance(filters, VectorAR):
         variance = np.diag(filters.covariance)
     else:
@@ -145,7 +145,7 @@ def _weights_of(filters: Noise, first: Float[Array, " outputs"]) -> Float[Array,
 
 
 def _taps(filters: Noise, weights: Float[Array, " outputs"]) -> Float[np.ndarray, "..."]:
-    """Noise filters of the weighted outputs, padded so that few lengths ever get compiled."""
+    """Noise filters of the weighted outputs, padded; few different lengths are compiled."""
     w = np.asarray(weights)
     if isinstance(filters, VectorAR):
         scale = np.outer(w, 1 / w)[..., None]
@@ -168,18 +168,18 @@ def _mix(filters: Noise, weights: Float[Array, " outputs"]) -> Float[Array, "...
 def _new_weights(
     point: Point, problem: Problem, first: Float[Array, " outputs"]
 ) -> Float[Array, " outputs"]:
-    """One over each output's residual deviation; recorded noise-free outputs keep a floor.
+    """Inverse of each output's residual deviation, which has a floor for noise-free recordings.
 
-    The floor is relative to the signal: relative to the present weights it would rise each round.
+    The floor is relative to the signal: relative to the weights it would rise in each round.
     """
     residual, now = np.asarray(point.found.residual), np.asarray(problem.weights)
-    # Rows at which a joint stands still are zero and do not count.
+    # Rows in which a joint is at rest are zero and do not count.
     samples = np.maximum(np.count_nonzero(residual, axis=(0, 1)), 1)
     spread = np.sqrt(np.einsum("rko,rko->o", residual, residual) / samples) / now
     return jnp.asarray(1 / np.maximum(spread, _FLOOR / np.asarray(first)))
 
 
-# Residuals below this share of a tenth of the signal are rounding.
+# Residuals below this share of a tenth of the signal are due to rounding.
 _FLOOR = 1e-10
 
 
@@ -190,7 +190,7 @@ def finer_substeps(done: Converged) -> int | None:
     if isinstance(done.loop.controller, OpenLoop):
         return None
     now, batch = done.loop.stepping.substeps or 1, done.batch
-    # A few recordings fit the compiled program; of many recordings, one is enough.
+    # Few recordings use the program that is already compiled; of many recordings, one is enough.
     if len(done.pieces) > 4:
         shortest = int(np.argmin([piece.samples for piece in done.pieces]))
         batch = taken(batch, np.array([shortest]))
@@ -210,17 +210,17 @@ def finer_substeps(done: Converged) -> int | None:
 def from_best_starts(
     method: OutputErrorSettings, loop: ClosedLoop, recordings: Sequence[Recording], batch: Batch
 ) -> Batch:
-    """The batch with the best initial states for the loop, where the method estimates them.
+    """The batch with the best initial states for the loop, if the method estimates them.
 
-    A recording that starts in motion determines its first velocity badly, as does one with a sensor
-    error. A fit estimates the initial state, so a comparison with a fit must do the same.
+    The measured velocity is poor at the start of a recording in motion, or with a sensor error. A
+    fit estimates the initial state, so a comparison with a fit must do the same.
     """
     signals, free = compared_signals(method, loop), estimated_starts(method, recordings, batch)
     if not free.any():
         return batch
     weights = jnp.asarray(first_weights(loop, tuple(recordings), signals))
     noise = jnp.asarray(_taps(None, weights))
-    # Equal bounds hold the parameters at their values.
+    # Equal bounds keep the parameters at their values.
     at, own = loop.theta, jnp.asarray(free)
     problem = Problem(loop, batch, weights, noise, own, at, at, signals, True)
     start = jnp.concatenate([batch.q0, batch.v0], axis=1)

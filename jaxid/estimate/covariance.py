@@ -23,16 +23,16 @@ Deviations = Literal["sandwich", "white", "paper"]
 
 SAID = {
     "sandwich": "sandwich estimate, which allows for coloured residuals",
-    "white": "equation (A.1) with the gradient of the filtered error, right if that error is white",
+    "white": "equation (A.1) with the gradient of the filtered error, valid if that error is white",
     "paper": "equation (A.1) with the filtered error's variance but the unfiltered gradient, as "
-    "printed by Brunot et al. 2016: not to be trusted",
+    "printed by Brunot et al. 2016: not reliable",
 }
 
 
 class Optimum(eqx.Module):
     """The optimum of a least-squares fit, which can be linearised again.
 
-    - `problem`: what was minimised; `theta`: its parameters, those of a noise filter last;
+    - `problem`: the minimised problem; `theta`: its parameters, those of a noise filter last;
       `start`: initial states.
     """
 
@@ -44,7 +44,7 @@ class Optimum(eqx.Module):
 class Reduced(eqx.Module):
     """Residuals and derivatives by recording, with nuisances projected out.
 
-    Nuisances are initial states and the noise filter's coefficients. `rows` says which rows count.
+    Nuisances are initial states and the noise filter's coefficients. `rows` marks rows that count.
     """
 
     residuals: list[Float[np.ndarray, "_samples outputs"]]
@@ -53,7 +53,7 @@ class Reduced(eqx.Module):
 
     @classmethod
     def of(cls, optimum: Optimum, found: Sensitivity | None = None) -> "Reduced":
-        """Score of an optimum, from its linearisation if it exists."""
+        """Residuals and derivatives at an optimum, from its linearisation if it exists."""
         problem = optimum.problem
         if found is None:
             found = linearise(problem, optimum.theta, optimum.start)
@@ -66,7 +66,7 @@ class Reduced(eqx.Module):
         if past.shape[1]:
             own = own - past @ np.linalg.lstsq(past, own, rcond=1e-12)[0]
         own = own.reshape(*jacobian.shape[:-1], p)
-        # Rows before the filter is filled are zero; freedom is counted on those that are not.
+        # Rows before the filter is filled are zero and do not count as degrees of freedom.
         kept = np.asarray(problem.batch.kept)
         residuals = [r[there] for r, there in zip(residual, kept, strict=True)]
         jacobians = [j[there] for j, there in zip(own, kept, strict=True)]
@@ -86,14 +86,14 @@ class Reduced(eqx.Module):
 
 
 def spent_by(problem: Problem) -> Float[np.ndarray, " outputs"]:
-    """Degrees of freedom that the estimated values take from each output."""
+    """Degrees of freedom of each output that are used by the estimated values."""
     outputs = problem.weights.shape[0]
     spent = np.full(outputs, problem.loop.theta.shape[0] / outputs)
     spent += float(np.sum(np.asarray(problem.free))) * 2 * problem.loop.joints / outputs
     if problem.coefficients is not None:
         rows = np.asarray(problem.coefficients.row)[np.asarray(problem.coefficients.there)]
         return spent + np.bincount(rows, minlength=outputs)
-    # A given filter counts as well: usually it was estimated from the same residuals.
+    # A given filter also counts, because it was usually estimated from the same residuals.
     taps = np.asarray(problem.noise)
     return spent + np.sum((taps != 0).reshape(outputs, -1), axis=1) - 1
 
@@ -109,8 +109,8 @@ def covariance_of(
     **Arguments:**
 
     - `kind`: see `SAID`.
-    - `noise`: filters that the kind `"paper"` takes the error's variance after.
-    - `found`: the linearisation at the optimum, if it is at hand.
+    - `noise`: filters for the error's variance of the kind `"paper"`.
+    - `found`: the linearisation at the optimum, if it exists.
     """
     problem = optimum.problem
     names = problem.loop.names
@@ -158,8 +158,8 @@ def score_covariance(
     """Covariance of J'r for coloured residuals, from their spectrum and that of J.
 
     Each output's residuals are modelled as one autoregressive process over all recordings, with the
-    order by AIC and a level for each recording: noise that grows with the torque is strongest where
-    the derivatives are largest. Outputs are assumed uncorrelated.
+    order chosen by AIC, and with a level for each recording, because noise that grows with the
+    torque is strongest where the derivatives are largest. Outputs are assumed to be uncorrelated.
     """
     outputs, p = jacobians[0].shape[1:]
     meat = np.zeros((p, p))
@@ -204,7 +204,7 @@ def deviations(fit: Fit) -> "pd.DataFrame":
     - `fit`: by `OEM`, `SeparablePEM` or `JointPEM`.
 
     **Returns:** a row for each parameter, a column for each of `"sandwich"`, `"white"` (A.1) and
-    `"paper"` (A.1 as printed numbers have it, with the gradient of the unfiltered error).
+    `"paper"` (A.1 with the gradient of the unfiltered error, as in the paper's numbers).
 
     **Raises:** `FitError` for a fit by regression.
     """

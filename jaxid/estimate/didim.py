@@ -20,7 +20,7 @@ from .result import AbstractMethod, Fit, Status
 
 
 def physical(loop: ClosedLoop, theta: Float[np.ndarray, " parameters"]) -> ClosedLoop:
-    """The loop at values moved inside their bounds; the loop itself where that is not enough.
+    """The loop at values moved inside their bounds; the unchanged loop if that is not enough.
 
     **Arguments:**
 
@@ -48,7 +48,7 @@ def _explaining(recordings: Recordings, runs: tuple[Simulated, ...]) -> list[Sim
 
 
 def _explained(loop: ClosedLoop, recordings: Recordings, runs: tuple[Simulated, ...]) -> bool:
-    """Whether no joint's simulated torque is further from the measured one than zero would be."""
+    """Whether the residual of every joint is smaller than its measured torque."""
     measured = compared(loop, recordings, [r.tau for r in recordings])
     simulated = compared(loop, recordings, [np.asarray(run.tau) for run in runs])
     pairs = list(zip(measured, simulated, strict=True))
@@ -83,7 +83,7 @@ class _Iterated(AbstractMethod):
             stacked, solved = self.solve_once(loop, recordings, _explaining(recordings, runs))
             moved = physical(loop, solved.theta)
             if moved is loop:
-                # Another regression on the same motion would give the same, and look settled.
+                # Another regression on the same motion would give the same and seem converged.
                 status = Status.unphysical
                 break
             loop = moved
@@ -101,7 +101,7 @@ class _Iterated(AbstractMethod):
         found = regression_fit(loop, recordings, self, stacked, solved, started, status, count)
         if found.status is not Status.misfit:
             return found
-        note = "simulated at these values, the torque is further from the measured one than zero is"
+        note = "at these values a joint's residual is larger than its measured torque"
         return dataclasses.replace(found, notes=(*found.notes, note))
 
 
@@ -139,7 +139,7 @@ class IDIMIV(_Iterated):
 
     **Arguments:**
 
-    - `filtering`: of the measured motion; parallel filter and decimation of all.
+    - `filtering`: filter of the measured motion; parallel filter and decimation of all signals.
     - `weights`: as for `IDIM`.
     - `tolerance`: relative change of every parameter at which it stops.
     - `max_steps`: largest number of simulations.

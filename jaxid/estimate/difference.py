@@ -1,4 +1,4 @@
-"""Direct differences: what every other method is better than."""
+"""Direct differences, a baseline for all other methods."""
 
 import equinox as eqx
 
@@ -12,12 +12,12 @@ from .states import AbstractStates, Differences
 class DifferenceLS(AbstractMethod):
     """Least squares along velocity and acceleration by differences, without any filter.
 
-    The direct difference model of Li, Peng and Juang 2023: encoder steps show multiplied by 1/T
-    and 1/T².
+    The direct difference model of Li, Peng and Juang 2023. Encoder errors are amplified by 1/T and
+    1/T².
 
     **Arguments:**
 
-    - `states`: which differences.
+    - `states`: the scheme of differences.
     - `weights`: `"joint"` (each joint by its own deviation), or `"encoder"` (the covariance that
       follows from the recordings' resolution).
     """

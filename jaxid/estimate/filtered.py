@@ -16,12 +16,12 @@ from .states import AbstractStates, LowPass
 class FilteredLS(AbstractMethod):
     """Least squares on the split regression through a first-order low-pass.
 
-    The literature's method (Slotine, Li 1987; Appendix D of Li, Peng, Juang 2023): momentum is
-    differentiated by s λ / (s + λ), so velocities are needed where `IntegralLS` has positions.
+    Momentum is differentiated by s λ / (s + λ) (Slotine, Li 1987; Appendix D of Li, Peng, Juang
+    2023). This needs velocities in terms for which `IntegralLS` needs positions.
 
     **Arguments:**
 
-    - `pole`: λ, 1/s; by default where the motion's spectrum falls below the noise.
+    - `pole`: λ, 1/s; by default the frequency above which the motion's spectrum is noise.
     - `transient`, `states`, `weights`: as for `IntegralLS`.
     """
 

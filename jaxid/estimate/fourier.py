@@ -13,15 +13,16 @@ class FourierLS(AbstractMethod):
     """Least squares along the position, velocity and acceleration of a fitted Fourier series.
 
     For periodic excitation (Swevers et al. 1997; Li, Peng, Juang 2023). The number of harmonics is
-    chosen by BIC, joints weighted by their encoder's errors.
+    chosen by BIC, with joints weighted by the errors of their encoders.
 
     **Arguments:**
 
-    - `period`: of the motion, s; found where None.
-    - `harmonics`: how many; chosen where None.
+    - `period`: period of the motion, s; detected if None.
+    - `harmonics`: number of harmonics; chosen if None.
     - `weights`: `"joint"` (each joint by its own deviation), or `"encoder"` (the covariance that
-      follows from the recordings' resolution). To first order, and with what the series leaves out
-      taken for noise: deviations come out too large for fine encoders and too small for coarse.
+      follows from the recordings' resolution, to first order). With `"encoder"` motion outside the
+      series counts as noise: deviations are too large for fine encoders and too small for coarse
+      ones.
     """
 
     period: float | None = eqx.field(static=True, default=None)

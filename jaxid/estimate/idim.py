@@ -27,7 +27,7 @@ Weights = Literal["ordinary", "joint", "robust"]
 
 
 class Stacked(eqx.Module):
-    """The decimated regression of all recordings: columns, right-hand side, row owners."""
+    """The decimated regression of all recordings: columns, right-hand side, recording by row."""
 
     columns: Float[np.ndarray, "samples joints parameters"]
     right: Float[np.ndarray, "samples joints"]
@@ -45,10 +45,10 @@ def stack(loop: ClosedLoop, recordings: Recordings, filtering: Filtering, motion
     **Arguments:**
 
     - `loop`: the model.
-    - `filtering`: of the motion and, in parallel, of torque and columns.
+    - `filtering`: filter of the motion and, in parallel, of torque and columns.
     - `motions`: simulated signals instead of the filtered ones, one for each recording.
 
-    **Raises:** `FitError` where the filtering does not suit a recording.
+    **Raises:** `FitError` if the filtering does not suit a recording.
     """
     columns, rights = [], []
     for k, recording in enumerate(recordings):
@@ -78,10 +78,10 @@ def solve(
     weights: Weights,
     instruments: Float[np.ndarray, "samples joints parameters"] | None = None,
 ) -> Solved:
-    """Least squares, or instrumental variables where instruments are given.
+    """Least squares, or instrumental variables if instruments are given.
 
-    Weighted: each joint's rows by its deviation, estimated from an ordinary solution first.
-    Robust: in addition each row by Huber's weight.
+    Weighted: rows are weighted by their joint's deviation, estimated from an ordinary solution.
+    Robust: each row has Huber's weight in addition.
     """
     joints, p = stacked.right.shape[1], stacked.columns.shape[2]
     if stacked.right.size <= p:
@@ -112,7 +112,7 @@ def solve(
     count = stacked.right.shape[0] - p / joints
     variance = sigma**2 * stacked.right.shape[0] / count
     if instruments is not None:
-        # Instruments determine only what they share with the columns.
+        # Instruments determine only directions that they share with the columns.
         basis, size, _ = np.linalg.svd(tools / _lengths(tools), full_matrices=False)
         wide = basis[:, size > 1e-11 * size[0]].T @ wide
     information = wide.T @ wide / variance
@@ -143,7 +143,7 @@ def regression_fit(
     fitted = fitted.hold(*shaped) if shaped else fitted
     notes = []
     if shaped:
-        notes.append(f"{', '.join(shaped)} stayed as given: torque is not linear in them")
+        notes.append(f"{', '.join(shaped)} not estimated, because torque is not linear in them")
     notes += _beyond_bounds(chosen, solved.theta)
     wrong = unphysical(fitted)
     if wrong and status is Status.converged:
@@ -175,7 +175,7 @@ def _beyond_bounds(chosen: Sequence[Parameter], theta: Float[np.ndarray, " p"]) 
     outside = [n for n, out in zip(names, (theta < low) | (theta > high), strict=True) if out]
     if not outside:
         return []
-    return [f"{', '.join(outside)} outside the declared bounds, which regressions do not enforce"]
+    return [f"{', '.join(outside)} outside the declared bounds: regressions do not enforce bounds"]
 
 
 class IDIM(AbstractMethod):
@@ -185,7 +185,7 @@ class IDIM(AbstractMethod):
 
     **Arguments:**
 
-    - `filtering`: of the motion, in Hz.
+    - `filtering`: filter of the motion, in Hz.
     - `weights`: `"ordinary"`, `"joint"` (each joint by its own deviation) or `"robust"` (Huber).
     """
 

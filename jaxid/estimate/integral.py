@@ -29,11 +29,11 @@ class IntegralLS(AbstractMethod):
 
     **Arguments:**
 
-    - `lambda1`, `lambda2`: poles, 1/s; by default where the motion's spectrum falls below
-      the noise.
+    - `lambda1`, `lambda2`: poles, 1/s; by default the frequency above which the motion's spectrum
+      is noise.
     - `transient`: the response to the unknown initial state is `"modelled"` by two columns for each
       joint, `"dropped"` with the first ten time constants, or `"ignored"`.
-    - `states`: where velocities come from.
+    - `states`: source of velocities.
     - `weights`: `"joint"` (each joint by its own deviation), or `"encoder"` (Appendix C: the
       covariance that follows from the recordings' resolution).
     """

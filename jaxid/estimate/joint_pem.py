@@ -29,7 +29,7 @@ from .start import start_values
 
 
 class JointPEM(AbstractMethod):
-    """Prediction error method, equations (7) and (11) of Brunot et al. 2016, all values at once.
+    """Prediction error method, equations (7) and (11) of Brunot et al. 2016, in one minimisation.
 
     Minimises the determinant of the prediction error's covariance over physical parameters, AR
     coefficients and initial states together (Ljung 1999, section 7.5). The residual is linear in
@@ -38,13 +38,13 @@ class JointPEM(AbstractMethod):
     **Arguments:**
 
     - `oem`: output, start, initial states and bounds are those of this method.
-    - `orders`: of the AR filters, one for each output, whose coefficients then start at zero; None
-      to fit by `oem` first, choose orders from its residuals, and start there.
-    - `criterion`, `highest`, `white`: of that choice, as for `SeparablePEM`.
+    - `orders`: orders of the AR filters, one for each output; their coefficients start at zero.
+      None to fit by `oem` first, choose orders from its residuals, and start from these filters.
+    - `criterion`, `highest`, `white`: for the choice of orders, as for `SeparablePEM`.
     - `coupled`: whether every output's filter depends on the past of all outputs.
     - `deviations`: `"white"` for (A.1), `"sandwich"` or `"paper"`.
 
-    **Raises:** `NoiseError` where the data do not allow such filters; its `fit` is the fit so far.
+    **Raises:** `NoiseError` if the data do not allow such filters; its `fit` is the fit so far.
     """
 
     oem: OEM = OEM()
@@ -82,7 +82,7 @@ class JointPEM(AbstractMethod):
         say: Callable[[str], None],
         deadline: float,
     ) -> tuple[Sequence[int], Noise, Converged | None]:
-        """Orders, and filters and fit to start from where orders were not given."""
+        """Orders; if they are not given, also the filters and the fit to start from."""
         if self.orders is not None:
             return self.orders, None, None
         first = converge(self.oem, loop, recordings, say, deadline=deadline)
@@ -103,9 +103,9 @@ def _converge_jointly(
     say: Callable[[str], None],
     deadline: float,
 ) -> Converged:
-    """Minimises repeatedly with the updated noise covariance, until that converges.
+    """Minimises repeatedly with the updated noise covariance, until the covariance converges.
 
-    At that point the gradient of the squared error is the gradient of the determinant.
+    At convergence the gradient of the squared error equals the gradient of the determinant.
     """
     oem = method.oem
     pieces, signals = pieces_of(recordings, oem.window), compared_signals(oem, loop)
@@ -161,7 +161,7 @@ def _converge_jointly(
 
 
 def _check_samples(problem: Problem, orders: Sequence[int]) -> None:
-    """Refuses orders that the recordings do not allow, before any work."""
+    """Checks that the recordings allow the orders, before the computation."""
     kept = np.asarray(problem.batch.kept)
     batch = problem.batch
     signals = [
@@ -175,7 +175,7 @@ def _check_samples(problem: Problem, orders: Sequence[int]) -> None:
 
 
 def _starting(problem: Problem, noise: Noise) -> Float[np.ndarray, " coefficients"]:
-    """Coefficients of given filters, of weighted outputs, in the problem's order; else zeros."""
+    """Coefficients of given filters for weighted outputs, in the problem's order, or zeros."""
     coefficients, w = problem.coefficients, np.asarray(problem.weights)
     assert coefficients is not None
     there = np.asarray(coefficients.there)
@@ -194,7 +194,7 @@ def _starting(problem: Problem, noise: Noise) -> Float[np.ndarray, " coefficient
 def _innovation_covariance(
     problem: Problem, minimum: Minimum
 ) -> Float[np.ndarray, "outputs outputs"]:
-    """Of the filtered error in weighted units, over the rows that are filled."""
+    """Covariance of the filtered error in weighted units, over rows with a filled filter."""
     assert problem.mix is not None
     e = np.asarray(minimum.point.found.residual) @ np.linalg.inv(np.asarray(problem.mix)).T
     count = np.sum(np.any(e != 0, axis=2))

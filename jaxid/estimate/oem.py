@@ -31,20 +31,21 @@ from .start import start_values
 class OEM(AbstractMethod):
     """Output error, equations (7) and (9) of Brunot et al. 2016, by Levenberg–Marquardt.
 
-    Fits all recordings at once, weights each output by its deviation, and keeps values physical.
+    It fits all recordings at once, weights each output by the inverse of its deviation, and keeps
+    values physical.
 
     **Arguments:**
 
-    - `output`: what is compared: `"torque"`, `"position"` or `"both"`; by default torque, but
-      position where the recorded torque drives the arm.
-    - `start`: `"auto"` starts from the best of the loop's own values, IDIM's and, where those leave
-      more than a fifth of the torque, DIDIM's; `"given"` from the loop's values.
-    - `initial`: `"rest"` trusts the first sample, `"free"` estimates every initial state,
-      `"auto"` estimates those of recordings that do not start at rest.
-    - `window`: length in s of pieces simulated on their own, each from its own estimated state
-      (multiple shooting); None for whole recordings.
-    - `deviations`: `"sandwich"` for coloured residuals, `"white"` for (A.1), `"paper"` for what
-      the paper prints.
+    - `output`: the compared signal: `"torque"`, `"position"` or `"both"`; by default torque, but
+      position if the recorded torque drives the arm.
+    - `start`: `"auto"` starts from the best of the loop's own values, those of IDIM and, if both
+      leave more than a fifth of the torque, those of DIDIM; `"given"` from the loop's values.
+    - `initial`: `"rest"` uses the first sample, `"free"` estimates every initial state, `"auto"`
+      estimates those of recordings that do not start at rest.
+    - `window`: length in s of pieces that are simulated separately, each from its own estimated
+      state (multiple shooting); None for whole recordings.
+    - `deviations`: `"sandwich"` for coloured residuals, `"white"` for (A.1), `"paper"` for (A.1) as
+      printed in the paper.
     - `tolerance`: it stops when a step is shorter than this many standard deviations.
     - `max_steps`: largest number of iterations, those for better weights included.
     - `max_seconds`: time limit, checked between iterations; the values so far are returned.
@@ -53,7 +54,7 @@ class OEM(AbstractMethod):
       Levenberg–Marquardt. It stops by its own tolerances and treats initial states as additional
       parameters. Bounds are enforced by a change of variables, so an estimate can approach a bound
       but not reach it.
-    - `mesh`: a `jax.sharding.Mesh` whose devices share the recordings; the numbers stay the same.
+    - `mesh`: a `jax.sharding.Mesh` whose devices share the recordings; results stay the same.
     """
 
     output: Output | None = eqx.field(static=True, default=None)
@@ -107,7 +108,7 @@ class OEM(AbstractMethod):
         return dataclasses.replace(found, notes=(*found.notes, *more))
 
     def _forgotten(self, loop: ClosedLoop) -> list[str]:
-        """A note on states that are not continued from window to window."""
+        """A note on states that are reset in every window."""
         if self.window is None:
             return []
         zeros = jnp.zeros(loop.joints)
@@ -116,7 +117,7 @@ class OEM(AbstractMethod):
         own += [type(loop.controller).__name__] if sum(x.size for x in jax.tree.leaves(law)) else []
         if not own:
             return []
-        said = "every window starts with the states of {} at rest, which may bias the estimates"
+        said = "in every window the states of {} start at rest, which may bias the estimates"
         return [f"{said.format(', '.join(own))}: compare with a fit without window"]
 
     def _from_start(
@@ -134,7 +135,7 @@ class OEM(AbstractMethod):
 
 
 def _without_diverging(loop: ClosedLoop, recordings: Recordings) -> Recordings:
-    """The recordings along which the loop can be simulated; all of them if there are none."""
+    """The recordings along which the loop can be simulated; all recordings if there are none."""
     runs = simulate(loop, recordings)
     sound = [np.isfinite(run.states).all() and np.isfinite(run.tau).all() for run in runs]
     kept = [r for r, good in zip(recordings, sound, strict=True) if good]
@@ -146,8 +147,8 @@ def _left_out(recordings: Recordings, kept: Recordings) -> list[str]:
     if not gone:
         return []
     return [
-        f"{len(gone)} of {len(recordings)} recordings left out, the loop diverges when it is "
-        f"simulated along them: {', '.join(gone)}"
+        f"{len(gone)} of {len(recordings)} recordings left out, because the simulation along them "
+        f"diverges: {', '.join(gone)}"
     ]
 
 

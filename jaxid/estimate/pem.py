@@ -55,15 +55,16 @@ class SeparablePEM(AbstractMethod):
     - `white`: significance of Ljung and Box's test, by which orders without white innovations are
       rejected (as in CAPTAIN's `aic`, Young 2011); None for the criterion alone.
     - `orders`: of the filters, one for each output, instead of a choice.
-    - `coupled`: one filter for all joints together, each driven by the past of all.
+    - `coupled`: whether there is one filter for all joints, each of which depends on the past of
+      all.
     - `first_step`: `"filtered"` for parameters from the filtered error; `"plain"` for the paper's
       variant, in which the parameters are those of output error.
-    - `deviations`: `"white"` for (A.1), `"sandwich"`, `"paper"`; by default the first where
-      parameters come from the filtered error and all recordings are as noisy, else the second.
+    - `deviations`: `"white"` for (A.1), `"sandwich"`, `"paper"`; by default `"white"` if parameters
+      come from the filtered error and all recordings are equally noisy, else `"sandwich"`.
     - `tolerance`: relative change of the prediction error's variance at which it stops.
     - `rounds`: largest number of alternations.
 
-    **Raises:** `NoiseError` where the residuals allow no such filter; its `fit` is the fit so far.
+    **Raises:** `NoiseError` if the residuals allow no such filter; its `fit` is the fit so far.
     """
 
     oem: OEM = OEM()
@@ -98,7 +99,7 @@ class SeparablePEM(AbstractMethod):
         return report(kind, done, recordings, seconds, self, noise, rounds)
 
     def _deviations(self, done: Converged, noise: Noise) -> Deviations:
-        """(A.1) assumes one noise level: the sandwich where recordings differ significantly."""
+        """(A.1), which assumes one noise level; the sandwich if levels differ significantly."""
         ratios = np.stack(levels([innovations(x, noise) for x in residual_series(done)]))
         uneven = np.any(ratios.max(axis=0) > 1.3 * ratios.min(axis=0))
         return "sandwich" if uneven or self.first_step == "plain" else "white"
@@ -116,7 +117,7 @@ class SeparablePEM(AbstractMethod):
             given = self.filters
             count = given.outputs if isinstance(given, VectorAR) else len(given)
             if count != outputs:
-                raise NoiseError(f"filters for {count} outputs are given, there are {outputs}")
+                raise NoiseError(f"filters are given for {count} outputs, but there are {outputs}")
             done = converge(self.oem, loop, recordings, say, self.filters, deadline)
             return done, self.filters, 0
         done = converge(self.oem, loop, recordings, say, deadline=deadline)
@@ -148,7 +149,7 @@ def keeping(done: Converged, method: OEM, recordings: Recordings) -> Iterator[No
 
 
 def residual_series(done: Converged) -> list[np.ndarray]:
-    """Measured less simulated, `(samples, outputs)` for each recording, in their own units."""
+    """Measured minus simulated, `(samples, outputs)` for each recording, in their own units."""
     raw = np.asarray(done.minimum.point.found.raw) / np.asarray(done.weights)
     mask = np.asarray(done.batch.kept)
     return [row[there] for row, there in zip(raw, mask, strict=True)]
@@ -159,7 +160,7 @@ def noise_filters(
 ) -> tuple[ARFilter, ...] | VectorAR:
     """The AR filter of each output's residuals, or of all together, over all recordings.
 
-    **Raises:** `NoiseError` where the residuals do not allow it.
+    **Raises:** `NoiseError` if the residuals do not allow it.
     """
     residuals = residual_series(done)
     outputs = residuals[0].shape[1]
@@ -186,7 +187,7 @@ def noise_filters(
 
 
 def output_name(done: Converged, output: int) -> str:
-    """How messages call an output."""
+    """The name of an output in messages."""
     signal, joint = divmod(output, done.loop.joints)
     what = {"tau": "torque", "q": "position"}[done.signals[signal]]
     return f"joint {joint + 1}'s {what}"

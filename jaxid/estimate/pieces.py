@@ -65,12 +65,12 @@ def rejoined(recordings, pieces, measured, errors):
 def compared_signals(method: OutputErrorSettings, loop: ClosedLoop) -> tuple[str, ...]:
     """The outputs of a method, of `"tau"` and `"q"`.
 
-    **Raises:** `FitError` where the recorded torque drives the loop and is to be compared.
+    **Raises:** `FitError` if the recorded torque drives the loop and is to be compared.
     """
     output = method.output or loop.controller.judged
     if output != "position" and isinstance(loop.controller, OpenLoop):
         raise FitError(
-            "the recorded torque drives this loop, so there is no torque to compare: use "
+            "the recorded torque is the input of this loop and cannot be compared: use "
             "OEM(output='position')"
         )
     return {"torque": ("tau",), "position": ("q",), "both": ("tau", "q")}[output]

@@ -1,4 +1,4 @@
-"""Likelihood profiles: the increase of the error when one parameter is held at other values."""
+"""Likelihood profiles: the increase of the error if one parameter is held at other values."""
 
 import dataclasses
 import html
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     import pandas as pd
     import plotly.graph_objects as go
 
-# In deviations: dense enough for a cubic, wide enough for intervals of 99.7 %.
+# Points in deviations: dense enough for a cubic, wide enough for intervals of 99.7 %.
 REACH = np.array([-4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0])
 
 
 class Profile(AbstractShown):
-    """Deviance of one parameter: twice the likelihood lost when it is held at a value.
+    """Deviance of one parameter: twice the decrease of log likelihood if it is held at a value.
 
-    `values` and `deviance` run along the profile; `others` are the other parameters there.
+    `values` and `deviance` are along the profile; `others` are the values of other parameters.
     """
 
     fit: Fit
@@ -65,7 +65,7 @@ class Profile(AbstractShown):
         return self.fit.units[self.fit.names.index(self.name)]
 
     def plot(self) -> "go.Figure":
-        """Deviance along the profile, and the parabola that the fit's deviation promises."""
+        """Deviance along the profile, and the parabola that follows from the fit's deviation."""
         from ..display import figures
 
         k = self.fit.names.index(self.name)
@@ -88,15 +88,15 @@ class Profile(AbstractShown):
 
 
 def profile(fit: Fit, *names: str, progress: bool = True) -> dict[str, Profile]:
-    """Likelihood profiles, all points of all of them fitted at once, vmapped.
+    """Likelihood profiles; all points of all profiles are fitted at once, vmapped.
 
     For a fit with sandwich deviations the error is not white, and the deviance is scaled by the
-    ratio of (A.1)'s variance to the sandwich's (Pace, Salvan, Sartori 2011).
+    ratio of the variance by (A.1) to that of the sandwich (Pace, Salvan, Sartori 2011).
 
     **Arguments:**
 
     - `fit`: by `OEM`, `SeparablePEM` or `JointPEM`; the noise filters of the former two are kept.
-    - `names`: of parameters; all of them by default.
+    - `names`: names of parameters; by default all.
     - `progress`: whether to show progress on a terminal.
 
     **Raises:** `FitError` for a fit by regression, or a parameter that it does not determine.
@@ -156,17 +156,17 @@ def _place(fit: Fit, name: str) -> int:
         raise FitError(f"{name!r} was not estimated: this fit has {', '.join(fit.names)}")
     k = fit.names.index(name)
     if not np.isfinite(fit.std[k]):
-        raise FitError(f"these recordings do not determine {name}, so it has no profile")
+        raise FitError(f"{name} has no profile: these recordings do not determine it")
     return k
 
 
 def _stretch(fit: Fit, white: Float[np.ndarray, " parameters"], k: int, scaled: bool) -> float:
-    """Factor by which the profile is wider than by (A.1)."""
+    """Factor by which the profile is wider than according to (A.1)."""
     return float(fit.std[k] / white[k]) if scaled else 1.0
 
 
 def _loss_and_variance(optimum) -> tuple[float, float]:
-    """Squared error at the minimum, and its unit: the variance of one filtered residual."""
+    """Squared error at the minimum, and the variance of one filtered residual, its unit."""
     reduced = Reduced.of(optimum)
     loss = sum(float(np.sum(r**2)) for r in reduced.residuals)
     rows = float(sum(np.sum(f) for f in reduced.filled()))

@@ -30,7 +30,7 @@ from .minimise import (
 )
 from .result import Fit
 
-# Fits in one vmap: enough to fill the vector units, few enough for the caches.
+# Number of fits in one vmap: enough for the vector units, few enough for the caches.
 LANES = 8
 
 
@@ -105,7 +105,7 @@ def _solver(problem: Problem) -> LevenbergMarquardt:
 def _settle(
     problem: Problem, near: Sensitivity, theta: Float[Array, " values"], start, steps: int
 ) -> tuple[Float[Array, " values"], Float[Array, "recordings initials"]]:
-    """Gauss-Newton steps with sensitivities from nearby values, and all else exact."""
+    """Gauss-Newton steps with sensitivities from nearby values and exact residuals."""
     n, own, solver = problem.loop.joints, problem.loop.theta.shape[0], _solver(problem)
 
     def point_at(theta, start) -> Point:
@@ -126,7 +126,7 @@ def _settle(
     y = problem.unknowns(jnp.clip(theta, problem.lower, problem.upper), start)
     state = solver.init(None, y, None, {}, None, None, frozenset())
     (y, state), _ = jax.lax.scan(body, (y, state), None, length=steps)
-    # The next trial point: where the last step leads, which was not evaluated yet.
+    # The end of the last step, which was not evaluated yet.
     theta, estimated = state.y_eval
     return theta, estimated if problem.free_start else start
 
@@ -134,7 +134,7 @@ def _settle(
 def _last_step(
     problem: Problem, point: Point
 ) -> tuple[Float[Array, " values"], Float[Array, "recordings initials"], Float[Array, ""]]:
-    """A full step, and how much it should lower the loss."""
+    """A full step, and its predicted decrease of the loss."""
     descent = _solver(problem).descent
     y, products = problem.unknowns(point.theta, point.start), point.sums.products(point.loss)
     state = descent.query(y, products, descent.init(y, jax.tree.map(jnp.zeros_like, products)))
@@ -162,7 +162,7 @@ def _changed(
     step: Float[Array, " parameters"],
     moved: Float[Array, "recordings initials"],
 ) -> Float[Array, "recordings samples outputs"]:
-    """What steps of parameters and initial states add to the residual."""
+    """Linear change of the residual by steps of parameters and initial states."""
     change = found.jacobian @ step
     return (
         change if found.start is None else change + jnp.einsum("rkoa,ra->rko", found.start, moved)
@@ -203,19 +203,19 @@ def refit(
     """Fits of a problem with other signals, filters, bounds or start values, vmapped.
 
     Gauss-Newton with fixed weights: some steps with the sensitivities at the problem's own values,
-    which need only a simulation each, and a last step with sensitivities at the new values.
-    Suitable for fits that end close to the problem's own; check `Refitted.last`.
+    which need only one simulation each, and a last step with sensitivities at the new values. The
+    fits must end close to the problem's own; check `Refitted.last`.
 
     **Arguments:**
 
-    - `optimum`: of a fit; its values and initial states are where sensitivities are taken.
-    - `steps`: how many before the last.
-    - `say`: told how far it is.
+    - `optimum`: optimum of a fit; sensitivities are computed at its values and initial states.
+    - `steps`: number of steps before the last.
+    - `say`: called with progress.
     """
     count, pieces = lanes.theta.shape[0], []
     for begin in range(0, count, LANES):
         say(f"{begin} of {count} fits", begin / count)
-        # A fixed number, padded with the last ones, so that one program serves all counts.
+        # The number is fixed, padded with the last ones; one program serves all counts.
         rows = np.minimum(np.arange(begin, begin + LANES), count - 1)
         some = jax.tree.map(lambda x, rows=rows: x[rows], lanes)
         pieces.append(jax.tree.map(np.asarray, _refit_some(optimum, some, steps)))
@@ -225,20 +225,20 @@ def refit(
 def redrawn(
     fit: Fit, noise: Sequence[Float[np.ndarray, "draws _samples outputs"]]
 ) -> Float[np.ndarray, "draws recordings samples outputs"]:
-    """Signals of the fitted model under other noise, padded.
+    """Signals of the fitted model with other noise, padded.
 
     **Arguments:**
 
-    - `noise`: on the outputs, for each recording.
+    - `noise`: noise of the outputs, for each recording.
 
-    **Raises:** `FitError` for regressions, and where only part of the signals is compared.
+    **Raises:** `FitError` for regressions, and if only part of the signals is compared.
     """
     optimum = optimum_of(fit, "draws")
     problem = optimum.problem
     if problem.batch.band is not None:
         raise FitError(
-            "noise cannot be drawn for a virtual controller, which compares a part of the torque "
-            "only: give the loop its own controller"
+            "noise cannot be drawn for a virtual controller, because only a part of the torque is "
+            "compared: give the loop its real controller"
         )
     found = linearise(problem, optimum.theta, optimum.start)
     clean = np.asarray(measured_of(problem)) - np.asarray(found.raw / problem.weights)
@@ -257,9 +257,9 @@ def refit_signals(
 ) -> Refitted:
     """Fits of other signals by the method of a fit.
 
-    Output error keeps the fit's weights. Joint prediction error estimates its filters from every
-    draw; for separable prediction error they are estimated from each draw's output-error residual
-    by Burg's method, with the orders of the fit.
+    Output error keeps the fit's weights. Joint prediction error estimates its filters with every
+    draw. For separable prediction error the filters are estimated from each draw's output-error
+    residual by Burg's method, with the orders of the fit.
 
     **Arguments:**
 
@@ -305,7 +305,7 @@ def drawn_noise(
     rng: np.random.Generator,
     strengths: Sequence[Float[np.ndarray, " outputs"]] | None = None,
 ) -> list[Float[np.ndarray, "draws _samples outputs"]]:
-    """Stationary noise of a filter, for recordings of these lengths, each with its strength."""
+    """Stationary noise of a filter, for recordings of given lengths and noise levels."""
     if isinstance(noise, VectorAR):
         made = [noise.simulate((draws, n), rng) for n in lengths]
     else:

@@ -25,11 +25,11 @@ class Filtering(eqx.Module):
 
     **Arguments:**
 
-    - `cutoff`: of the low-pass on position, applied forward and backward, Hz; by default where
-      the recorded motion's spectrum falls below the noise.
+    - `cutoff`: cutoff of the low-pass on position, applied forward and backward, Hz; by default the
+      frequency above which the recorded motion's spectrum is noise.
     - `rate`: sample rate after decimation, Hz; by default the cutoff.
-    - `order`: of the Butterworth filter.
-    - `trim`: dropped at both ends, s; by default five samples after decimation.
+    - `order`: order of the Butterworth filter.
+    - `trim`: time dropped at both ends, s; by default five samples after decimation.
     """
 
     cutoff: float | None = eqx.field(static=True, default=None)
@@ -38,7 +38,7 @@ class Filtering(eqx.Module):
     trim: float | None = eqx.field(static=True, default=None)
 
     def on(self, recording: Recording) -> "Filtering":
-        """The same with a fixed cutoff, so that the spectrum is computed once."""
+        """The same with a fixed cutoff; the spectrum is then computed only once."""
         return dataclasses.replace(self, cutoff=self.settled(recording)[0])
 
     def settled(self, recording: Recording) -> tuple[float, int, int]:
@@ -59,7 +59,7 @@ class Filtering(eqx.Module):
         if recording.samples - 2 * trim < 4 * factor:
             raise FitError(
                 f"{recording.name} has {recording.samples} samples, too few for decimation by "
-                f"{factor} and {trim} dropped at each end: raise rate or lower trim"
+                f"{factor} with {trim} samples dropped at each end: raise rate or lower trim"
             )
         return cutoff, factor, trim
 
@@ -82,7 +82,7 @@ def filtered(recording: Recording, filtering: Filtering) -> Simulated:
 def linear_parameters(loop: ClosedLoop) -> tuple[Parameter, ...]:
     """The free parameters in which torque is linear.
 
-    **Raises:** `FitError` where there are none.
+    **Raises:** `FitError` if there are none.
     """
     found = tuple(p for p in loop.free_parameters if p.declaration.linear)
     if not found:
@@ -151,9 +151,10 @@ def regression(
 
     **Arguments:**
 
-    - `loop`: which arm and effects; parameters that are held stay at their values.
-    - `recording`: whose torque is explained.
-    - `motion`: filtered or simulated position, velocity and acceleration; `tau` is explained.
+    - `loop`: arm and effects; held parameters stay at their values.
+    - `recording`: the recording of the torque.
+    - `motion`: filtered or simulated position, velocity and acceleration; `tau` is the torque to
+      explain.
     """
     n = motion.q.shape[0]
     label = np.full(n, recording_label(recording.name))

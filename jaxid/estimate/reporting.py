@@ -23,12 +23,12 @@ def report(
     noise: Noise = None,
     rounds: int = 0,
 ) -> Fit:
-    """The `Fit`.
+    """The `Fit` of a minimisation.
 
     **Arguments:**
 
-    - `method`: as results show it. `kind`: of deviations.
-    - `seconds`: that it took. `noise`: the filters found. `rounds`: of filters and parameters.
+    - `method`: as shown by results. `kind`: kind of deviations.
+    - `seconds`: duration. `noise`: the estimated filters. `rounds`: number of alternations.
     """
     found, mask = done.minimum.point.found, np.asarray(done.batch.kept)
     p = len(done.loop.names)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class Bootstrap(AbstractShown):
     """Estimates from simulated recordings, `(draws, parameters)`, with the original fit.
 
-    `settled` says which draws ended within a tenth of a deviation of their minimum.
+    `settled` marks draws that ended within a tenth of a deviation of their minimum.
     """
 
     fit: Fit
@@ -58,7 +58,7 @@ class Bootstrap(AbstractShown):
         )
 
     def shown(self) -> Fit:
-        """The fit, showing these deviations."""
+        """The fit with these deviations."""
         covariance = np.atleast_2d(np.cov(self.theta, rowvar=False))
         said = f"parametric bootstrap of {len(self.theta)} draws"
         return dataclasses.replace(self.fit, covariance=covariance, deviations=said)
@@ -100,13 +100,13 @@ def bootstrap(fit: Fit, draws: int = 200, *, seed: int = 0, progress: bool = Tru
     if not fit.succeeded or not np.isfinite(problem.weights).all():
         raise FitError(f"a fit that {fit.status.value} has no bootstrap: make it converge first")
     if draws < 2:
-        raise FitError(f"{draws} draws give no deviation: use 2 or more, 200 for intervals")
+        raise FitError(f"{draws} draws give no deviation: use at least 2, or 200 for intervals")
     noise = fit.noise
     if noise is None:
         noise = residual_filters(fit)
     lengths = [len(r) for r in fit.residuals]
     if len(lengths) != problem.batch.q.shape[0]:
-        raise FitError("bootstrap is for whole recordings: fit without window")
+        raise FitError("bootstrap needs whole recordings: fit without window")
     strengths = levels([innovations(r, noise) for r in fit.residuals])
     made = drawn_noise(noise, lengths, draws, np.random.default_rng(seed), strengths)
     with working(f"bootstrap of {fit.loop.name}", progress) as say:
@@ -120,5 +120,5 @@ def residual_filters(fit: Fit) -> tuple[ARFilter, ...] | VectorAR:
     """AR filters of a fit's residuals."""
     series = [[r[:, j] - r[:, j].mean() for r in fit.residuals] for j in range(fit.loop.joints)]
     if fit.optimum.problem.weights.shape[0] != fit.loop.joints:
-        raise FitError("bootstrap is for one output a joint: fit torque or position, not both")
+        raise FitError("bootstrap needs one output per joint: fit torque or position, not both")
     return tuple(fit_ar(x) for x in series)

@@ -31,22 +31,20 @@ class Status(enum.Enum):
     converged = "converged"
     stalled = "stopped without progress before the tolerance was met"
     max_steps = "reached the largest number of iterations; raise max_steps"
-    max_seconds = "reached its limit of time; raise max_seconds"
+    max_seconds = "reached its time limit; raise max_seconds"
     diverged = "no parameter values were found at which the loop can be simulated"
     overflowed = "numbers overflowed float64; check the units of the recordings"
     unphysical = "ended at unphysical values: the mass matrix is not positive definite"
-    misfit = "describes the recordings no better than no model would"
+    misfit = "does not describe the recordings better than no model"
     out_of_solver_steps = (
         "the integration ran out of steps before a recording's end; raise Stepping(max_steps=...), "
         "loosen the tolerances of its controller, or choose an implicit solver"
     )
     smallest_solver_step = (
-        "the integration's step fell below the smallest one allowed; choose an implicit solver, or "
-        "look for a value that makes the loop stiff"
+        "the integration's step became smaller than allowed; choose an implicit solver, or look "
+        "for a value that makes the loop stiff"
     )
-    implicit_step_failed = (
-        "an implicit step found no solution; take smaller steps or another solver"
-    )
+    implicit_step_failed = "an implicit step found no solution; use smaller steps or another solver"
 
     @property
     def simulated(self) -> bool:
@@ -63,12 +61,14 @@ class Fit(AbstractShown):
     """Result of an estimation: the fitted loop, covariance, residuals, status.
 
     - `loop`: the model with the estimated values.
-    - `covariance`: of `loop.theta`, `(parameters, parameters)`; infinite where not determined.
-    - `residuals`: measured less simulated torque (for a position output: position), one
+    - `covariance`: covariance of `loop.theta`, `(parameters, parameters)`; infinite if not
+      determined.
+    - `residuals`: measured minus simulated torque (for a position output: position), one
       `(samples, joints)` for each recording.
     - `undetermined`: sentences that name combinations of parameters that the data do not determine.
     - `notes`: other remarks.
-    - `noise`: the noise filters found or given, one for each output or one of all; None for white.
+    - `noise`: estimated or given noise filters, one for each output or one for all; None for white
+      noise.
     - `rounds`: number of alternations between parameters and filters.
     - `optimum`: the least-squares problem at its minimum, for deviations, bootstrap and profile;
       None for regressions.
@@ -108,7 +108,7 @@ class Fit(AbstractShown):
 
     @property
     def std(self) -> Float[np.ndarray, " parameters"]:
-        """Standard deviations, in the units of the parameters; infinite where not determined."""
+        """Standard deviations, in the units of the parameters; infinite if not determined."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -118,12 +118,12 @@ class Fit(AbstractShown):
 
     @property
     def innovations(self) -> tuple[Float[np.ndarray, "_samples joints"], ...]:
-        """Residuals through the inverse of the noise filters; zero where the past is not known."""
+        """Residuals through the inverse of the noise filters; zero if the past is not known."""
         noise = self.noise
         if isinstance(noise, VectorAR) and noise.outputs > self.loop.joints:
             raise FitError(
-                "a filter of torque and position together has no innovations of torque alone: "
-                "fit one of the two, or without coupled"
+                "a coupled filter of torque and position has no innovations of torque alone: fit "
+                "one of the two, or without coupled"
             )
         if noise is not None and not isinstance(noise, VectorAR):
             noise = noise[: self.loop.joints]
@@ -134,7 +134,7 @@ class Fit(AbstractShown):
 
         **Arguments:**
 
-        - `lags`: at least; twenty more than the order of a filter.
+        - `lags`: number of lags; at least twenty more than the order of a filter are used.
         """
         import pandas as pd
 
@@ -192,7 +192,7 @@ class Fit(AbstractShown):
 
         - `path`: by convention with the ending `.jaxid`; an existing file is replaced.
 
-        **Raises:** `SaveError` where it cannot be written.
+        **Raises:** `SaveError` if it cannot be written.
         """
         return save(self, path)
 
@@ -228,8 +228,8 @@ class Fit(AbstractShown):
 class AbstractMethod(eqx.Module):
     """An estimator with its settings.
 
-    Class attribute, False by default: `rigid`, True for methods that assume that the sensors show
-    the motion of drives and links.
+    Class attribute, False by default: `rigid`, True for methods that assume that the sensors
+    measure the motion of drives and links.
     """
 
     rigid: ClassVar[bool] = False
@@ -284,22 +284,22 @@ def determined_covariance(
     **Arguments:**
 
     - `information`: J'J of the weighted residuals.
-    - `names`: of its rows. `scales`: typical sizes of these parameters.
-    - `meat`: covariance of the score where it is not `information`; gives the sandwich.
+    - `names`: names of its rows. `scales`: typical sizes of these parameters.
+    - `meat`: covariance of the score if it is not `information`; the result is then the sandwich.
     """
     if not (np.isfinite(information).all() and (meat is None or np.isfinite(meat).all())):
-        lost = "the signals' derivatives overflow float64, so no deviation is known"
+        lost = "the signals' derivatives overflow float64, so deviations are unknown"
         return np.diag(np.full(len(names), np.inf)), (lost,)
     size = np.sqrt(np.maximum(np.diag(information), 0))
-    # A parameter without influence even at ten thousand times its usual size: its column is
-    # rounding only.
+    # A parameter that has no influence even at ten thousand times its usual size: its column is due
+    # to rounding.
     heard = size * scales > 1e-4
     size = np.where(heard, size, 0.0)
     information = information * np.outer(heard, heard)
     floor = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(information / np.outer(floor, floor))
-    # Columns have unit length and rounding is 1e-16, so along a direction below 1e-11 the signals
-    # change by less than their own rounding.
+    # Columns have unit length and rounding is 1e-16, so along a direction with an eigenvalue below
+    # 1e-11 the signals change by less than rounding.
     weak = values < 1e-11
     strong = vectors[:, ~weak]
     inverse = (strong / values[~weak]) @ strong.T / np.outer(floor, floor)
@@ -325,7 +325,7 @@ def determined_covariance(
 
 
 def unphysical(loop: ClosedLoop) -> list[str]:
-    """A note where the mass matrix is not positive definite."""
+    """A note if the mass matrix is not positive definite."""
     if float(_smallest_inertia(loop.arm)) > 0:
         return []
     return ["these values are not physical: the mass matrix is not positive definite"]

@@ -23,15 +23,15 @@ def start_values(
     say: Callable[[str], None],
     batch: Batch | None = None,
 ) -> ClosedLoop:
-    """The loop at the best start: its own values, IDIM's or DIDIM's, by simulated torque error.
+    """The loop at the best start values: its own, those of IDIM or those of DIDIM.
 
-    DIDIM is used only where the others leave much of the torque. Parameters in which torque is not
-    linear keep their values.
+    The best ones have the smallest simulated torque error. DIDIM is used only if the others leave
+    much of the torque. Parameters in which torque is not linear keep their values.
 
     **Arguments:**
 
-    - `start`: `"given"` for the loop as it is, else `"auto"`.
-    - `batch`: the recordings prepared, if they are already.
+    - `start`: `"given"` for the unchanged loop, else `"auto"`.
+    - `batch`: the prepared recordings, if they exist.
     """
     if start == "given":
         return loop

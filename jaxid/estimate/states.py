@@ -33,8 +33,8 @@ class AbstractStates(eqx.Module):
 
         **Arguments:**
 
-        - `recording`: whose sample rate and spectrum decide the settings.
-        - `x`: samples used instead of its positions.
+        - `recording`: its sample rate and spectrum determine the settings.
+        - `x`: samples to use instead of its positions.
         """
 
     @abc.abstractmethod
@@ -46,7 +46,7 @@ class AbstractStates(eqx.Module):
         """Number of samples that one sample affects; None for all."""
 
     def resolved(self, recording: Recording) -> "AbstractStates":
-        """The same with settings fixed for a recording."""
+        """The same with fixed settings, determined from a recording."""
         return self
 
     def motion(self, recording: Recording) -> Simulated:
@@ -68,7 +68,7 @@ class Differences(AbstractStates):
     scheme: Literal["backward", "central"] = eqx.field(static=True, default="backward")
 
     def rates(self, recording: Recording, x: Float[np.ndarray, "samples columns"]) -> Rates:
-        """Position as it is, its first and second difference."""
+        """The unchanged position, its first and second difference."""
         step = recording.period
         if self.scheme == "central":
             a = np.zeros_like(x)
@@ -107,7 +107,7 @@ class LowPass(AbstractStates):
         return q, v, np.gradient(v, recording.period, axis=0)
 
     def edge(self, recording: Recording) -> int:
-        """What the filtering trims."""
+        """The samples that the filtering trims."""
         return self.filtering.settled(recording)[2]
 
     def memory(self, recording: Recording) -> int:
@@ -120,8 +120,8 @@ class FourierStates(AbstractStates):
 
     **Arguments:**
 
-    - `period`: of the motion, s; found from the recording where None.
-    - `harmonics`: how many; found from the recording where None.
+    - `period`: period of the motion, s; detected from the recording if None.
+    - `harmonics`: number of harmonics; chosen from the recording if None.
     """
 
     period: float | None = eqx.field(static=True, default=None)
@@ -130,12 +130,12 @@ class FourierStates(AbstractStates):
     def settled(self, recording: Recording) -> Harmonics:
         """Period and number of harmonics for a recording.
 
-        **Raises:** `FitError` where it is not periodic, or too short for the harmonics.
+        **Raises:** `FitError` if it is not periodic, or too short for the harmonics.
         """
         return settle_harmonics(recording, period_of(recording, self.period), self.harmonics)
 
     def resolved(self, recording: Recording) -> "FourierStates":
-        """With its period and number of harmonics."""
+        """The same with period and number of harmonics of a recording."""
         found = self.settled(recording)
         return FourierStates(found.period, found.harmonics)
 
@@ -159,5 +159,5 @@ class FourierStates(AbstractStates):
         return 0
 
     def memory(self, recording: Recording) -> None:
-        """None: every sample affects all."""
+        """None, because every sample affects all."""
         return None

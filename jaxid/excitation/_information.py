@@ -28,7 +28,7 @@ def along(
     signals: Float[Array, "3 points joints"],
     tau: Float[Array, "points joints"],
 ) -> Motion:
-    """Position, velocity, acceleration and commanded torque as effects see them."""
+    """Position, velocity, acceleration and commanded torque, in the form that effects need."""
     n = time.shape[0]
     q, v, a = signals
     return jax.vmap(Motion)(time, q, v, a, tau, jnp.zeros((n, 0)), jnp.full(n, NOBODY))
@@ -59,7 +59,7 @@ def torque_along(
 
 
 def chosen_parameters(loop: ClosedLoop, kind: Kind) -> tuple[Parameter, ...]:
-    """The parameters to determine; with inverse dynamics, those in which torque is linear."""
+    """The parameters to determine; for inverse dynamics, those in which torque is linear."""
     return linear_parameters(loop) if kind == "inverse-dynamics" else loop.free_parameters
 
 
@@ -91,7 +91,7 @@ def intervals_of(
     second = (3 * move - 2 * v - then) / safe
     third = (v + then - 2 * move) / safe**2
     n, joints = q.shape
-    # A sampled law ticks at every point of the grid except the last.
+    # A sampled law is evaluated at every grid point except the last.
     ticks = jnp.arange(n) < n - 1
     return jax.vmap(Interval)(
         jnp.asarray(time),
@@ -110,11 +110,11 @@ def closed_loop_columns(
     time: Float[Array | np.ndarray, " points"],
     signals: Float[Array, "3 points joints"],
 ) -> tuple[Float[Array, "points 3 joints"], Float[Array, "points joints parameters"]]:
-    """Torque, position and velocity of the loop that tracks a reference from rest at its start.
+    """Torque, position and velocity of the loop that tracks a reference, at rest at the start.
 
     **Returns:** `(points, 3, joints)`, and the derivative of torque by the free parameters.
     """
-    # A design follows the gradient of these columns.
+    # The design needs the gradient of these columns.
     loop = with_reverse_mode(loop, len(time))
     intervals = intervals_of(loop, time, signals)
     q0, v0 = signals[0, 0], jnp.zeros_like(signals[0, 0])
@@ -132,7 +132,7 @@ def closed_loop_columns(
 def information_of(
     columns: Float[Array, "points joints parameters"], noise: Float[Array, " joints"]
 ) -> Float[Array, "parameters parameters"]:
-    """Information matrix for white torque noise of these deviations, `(joints,)`."""
+    """Information matrix for white torque noise with these standard deviations, `(joints,)`."""
     scaled = columns / noise[:, None]
     return jnp.einsum("kjp,kjq->pq", scaled, scaled)
 
@@ -140,20 +140,20 @@ def information_of(
 def _by_size(
     information: Float[Array, "parameters parameters"], scales: Float[Array, " parameters"]
 ) -> tuple[Float[Array, "parameters parameters"], Float[Array, " parameters"]]:
-    """Correlations of the columns, and their lengths, each parameter in units of its scale."""
+    """Correlations of the columns, and their norms; each parameter is in units of its scale."""
     p = information.shape[0]
     scaled = information * jnp.outer(scales, scales)
     size = jnp.sqrt(jnp.diag(scaled))
     size = jnp.where(size > 0, size, 1.0)
-    # Parameters that are not identifiable have no deviation; a floor near rounding error keeps the
-    # search going.
+    # Parameters that are not identifiable have no finite deviation; a floor near rounding error
+    # keeps the criterion finite.
     return scaled / jnp.outer(size, size) + 1e-13 * jnp.eye(p), size
 
 
 def log_volume(
     information: Float[Array, "parameters parameters"], scales: Float[Array, " parameters"]
 ) -> Float[Array, ""]:
-    """Half the log det of the covariance, by parameter: the size of the ellipsoid of errors."""
+    """Half the log det of the covariance per parameter: the size of the error ellipsoid."""
     correlated, size = _by_size(information, scales)
     value = jnp.linalg.slogdet(correlated)[1] + 2 * jnp.sum(jnp.log(size))
     return -value / (2 * information.shape[0])

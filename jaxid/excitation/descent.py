@@ -16,7 +16,7 @@ from .limits import margins_along
 # Factor by which the grid on which a result is checked is finer.
 _FINER = 10
 
-# Number of times that violated points are added to the constraints before the step is shortened.
+# Violated points are added to the constraints this many times before the step is shortened.
 _EXCHANGES = 4
 
 
@@ -36,7 +36,7 @@ def random_references(
     joints = design.base.shape[1]
     span = (design.limits.high - design.limits.low) / 2
     drawn = rng.normal(size=(count, *design.shape)) * span
-    # Each joint moves in proportion to its range of position, times a random factor of its own.
+    # The amplitude of a joint is proportional to its range of position, times a random factor.
     drawn *= rng.uniform(0.3, 1.5, (count, 1, joints))
     drawn = centre + drawn.reshape(count, -1)
     shares = jax.lax.map(
@@ -156,20 +156,20 @@ def _descend_on(
 def shrunk(
     design: Design, z: Float[np.ndarray, " numbers"], centre: Float[np.ndarray, " numbers"]
 ) -> Float[np.ndarray, " numbers"]:
-    """The reference, shrunk towards a pose if needed until limits hold between grid points too."""
+    """The reference, shrunk towards a pose until limits also hold between grid points."""
     share = 1.0
     for _ in range(60):
         at = centre + share * (z - centre)
         if float(all_margins(design, at)[0].min()) >= 0:
             return at
         share *= 0.995 if share > 0.9 else 0.95
-    raise LimitsError("no reference was found that keeps all limits: widen them")
+    raise LimitsError("no reference was found within all limits: widen them")
 
 
 def all_margins(
     design: Design, z: Float[np.ndarray, " numbers"]
 ) -> tuple[Float[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
-    """The smallest margin of each limit on the fine grid, of the reference and of its tracking."""
+    """The smallest margin to each limit on the fine grid, for the reference and the tracking."""
     count = _FINER * max(len(design.time), round(design.period * 1.0) * 100)
     time = np.arange(count) * design.period / count
     coefficients = np.asarray(design.coefficients(z))
@@ -178,8 +178,8 @@ def all_margins(
     tau = torque_along(design.loop, jnp.asarray(time), signals)
     rows, inside = margins_along(design.limits, signals, tau)
     smallest = np.concatenate([np.asarray(rows).min(axis=0).ravel(), np.asarray(inside).min(0)])
-    # Upper bound on how far a series of this many harmonics rises between points of the fine grid
-    # (Ehlich and Zeller 1964).
+    # Upper bound of a series of this many harmonics between points of the fine grid, relative to
+    # its largest value on them (Ehlich and Zeller 1964).
     smallest = smallest - (1 / np.cos(np.pi * harmonics / count) - 1)
     if design.settings.kind != "closed-loop":
         return smallest, smallest

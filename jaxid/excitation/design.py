@@ -27,7 +27,7 @@ from ._information import (
 )
 from .limits import SIDES, Limits, margins_along
 
-# Distance kept from the limits on the grid where they are imposed.
+# Margin to the limits on the grid on which they are imposed.
 SLACK = 1e-3
 
 
@@ -89,7 +89,7 @@ def feasible_share(
         return jnp.where(fits, middle, low), jnp.where(fits, high, middle)
 
     found = jax.lax.fori_loop(0, 20, body, (jnp.zeros(()), jnp.ones(())))[0]
-    # A smaller motion may violate a limit that a larger one keeps.
+    # A smaller motion may violate a limit that a larger one satisfies.
     return jnp.where(good(1.0), 1.0, found)
 
 
@@ -136,20 +136,20 @@ def _check(
         )
     if period <= 0 or harmonics < 2:
         raise FitError(
-            f"a period of {period:g} s and {harmonics} harmonics make no reference that starts at "
-            "rest: take a positive period and at least two harmonics"
+            f"a period of {period:g} s and {harmonics} harmonics do not allow a reference that "
+            "starts at rest: choose a positive period and at least two harmonics"
         )
     if harmonics / period >= rate / 4:
         raise FitError(
             f"{harmonics} harmonics of {period:g} s reach {harmonics / period:.3g} Hz, more than a "
-            f"quarter of the sample rate of {rate:g} Hz: take fewer, or a longer period"
+            f"quarter of the sample rate of {rate:g} Hz: choose fewer, or a longer period"
         )
     wrong = [x for x in (noise, start) if x is not None and np.ndim(x) and len(x) != loop.joints]
     if wrong:
         raise FitError(f"{len(wrong[0])} values are given for {loop.joints} joints: give one each")
     own = loop.controller.period
     if own is not None and abs(own * rate - 1) > 1e-6:
-        raise FitError(f"the controller ticks every {own:g} s: design at its rate, {1 / own:g} Hz")
+        raise FitError(f"the controller's period is {own:g} s: design at its rate, {1 / own:g} Hz")
 
 
 def _static_margins(
@@ -171,11 +171,11 @@ def pose_within(
 ) -> Float[np.ndarray, " joints"]:
     """A pose at which the arm can stand still within all limits, `(joints,)`.
 
-    **Raises:** `LimitsError` that names the limit that allows none.
+    **Raises:** `LimitsError` if no pose is within all limits; the message names one limit.
     """
     if start is not None:
         poses = np.asarray(start, float).reshape(1, -1)
-        where = "at the start that is given"
+        where = "at the given start"
     else:
         points = _grid(loop.joints)
         poses = limits.low + (limits.high - limits.low) * points
@@ -189,23 +189,23 @@ def pose_within(
     joints = loop.joints
     if kind >= 8 * joints:
         raise LimitsError(
-            f"limits.workspace leaves no pose {where}: the nearest lies {-worst[best]:.3g} outside "
-            "it; widen it, or limits.low and limits.high"
+            f"limits.workspace allows no pose {where}: the nearest pose is {-worst[best]:.3g} "
+            "outside; widen it, or limits.low and limits.high"
         )
     name, joint = SIDES[kind // joints], kind % joints + 1
     if name == "torque":
         needed = limits.torque[joint - 1] * (1 - worst[best])
         raise LimitsError(
-            f"limits.torque of joint {joint} is {limits.torque[joint - 1]:.4g}, but to stand still "
-            f"{where} takes at least {needed:.4g}: raise it, or move the limits of position"
+            f"limits.torque of joint {joint} is {limits.torque[joint - 1]:.4g}, but standing still "
+            f"{where} needs at least {needed:.4g}: raise it, or move the limits of position"
         )
     raise LimitsError(
-        f"limits.{name} of joint {joint} leaves no room {where}: widen it, or start elsewhere"
+        f"limits.{name} of joint {joint} allows no pose {where}: widen it, or start elsewhere"
     )
 
 
 def _grid(joints: int) -> Float[np.ndarray, "points joints"]:
-    """Points that fill the unit cube, its centre first."""
+    """Points that fill the unit cube; the first is its centre."""
     import scipy
 
     middle = np.full((1, joints), 0.5)
@@ -227,7 +227,7 @@ def make_design(
     noise: Sequence[float] | np.ndarray | None = None,
     start: Sequence[float] | np.ndarray | None = None,
 ) -> tuple[Design, Float[np.ndarray, " numbers"]]:
-    """The search space, and the free numbers of a pose that keeps all limits.
+    """The search space, and the free numbers of a pose within all limits.
 
     Arguments are those of `optimal_excitation`.
     """
@@ -239,7 +239,7 @@ def make_design(
     pose = pose_within(loop, limits, None if start is None else np.asarray(start, float))
     at_start = fourier_basis(np.zeros(1), period, harmonics)[:, 0]
     rest = at_start[1:] if start is None else at_start
-    # High harmonics start small, since their speed and acceleration grow with the harmonic number.
+    # High harmonics start small, because speed and acceleration grow with the harmonic number.
     own = 1 / np.concatenate([[1.0], np.repeat(np.arange(1, harmonics + 1), 2)]) ** 1.5
     span = own[:, None] * scipy.linalg.null_space(rest * own)
     base = np.zeros((2 * harmonics + 1, loop.joints))
@@ -249,7 +249,7 @@ def make_design(
         base = level
     centre = np.linalg.lstsq(span, level - base, rcond=None)[0].ravel()
     n = round(period * rate)
-    # With more samples than these, sums over a period hardly change.
+    # Sums over a period hardly change with more samples than these.
     few = n if kind == "closed-loop" else min(n, 24 * harmonics)
     samples = np.arange(few + (kind == "closed-loop")) * period / few
     points = np.arange(64 * harmonics) * period / (64 * harmonics)

@@ -42,8 +42,8 @@ class Limits(eqx.Module):
             value = getattr(self, name)
             if len(value) != joints:
                 raise LimitsError(
-                    f"limits.{name} has {len(value)} values where limits.low has {joints}: give "
-                    "one a joint"
+                    f"limits.{name} has {len(value)} values, but limits.low has {joints}: give one "
+                    "per joint"
                 )
             for j, x in enumerate(value, start=1):
                 if name != "high" and not x > 0:
@@ -80,7 +80,7 @@ class Limits(eqx.Module):
 
 
 class PlanarReach(eqx.Module):
-    """Keeps the tip of turning links in a plane inside a box.
+    """Keeps the tip of an arm whose links turn in a plane inside a box.
 
     x points along the stretched arm at q = 0 (down, for a hanging arm), y a quarter turn further.
 

@@ -48,27 +48,28 @@ def optimal_excitation(
     """Finds the reference that determines the parameters best.
 
     Each joint follows a finite Fourier series that starts and ends at rest (Swevers et al. 1997).
-    SLSQP with exact gradients starts from the best of random references. Limits are repeatedly
-    imposed where they are nearest, and checked on a grid ten times as fine.
+    SLSQP with exact gradients starts from the best of random references. Limits are imposed at the
+    points that are nearest to them; these are chosen again in each round. Limits are checked on a
+    grid that is ten times finer.
 
     **Arguments:**
 
     - `loop`: the model at the best known values; its free parameters are to be determined.
     - `limits`: of the reference and of the torque that it needs.
     - `period`: s. `harmonics`: their number. `rate`: sample rate, Hz.
-    - `kind`: `"inverse-dynamics"` for regressions, `"closed-loop"` for `OEM`: the sensitivities of
-      the simulated loop, whose motion and torque must then keep the limits too.
-    - `criterion`: what is minimised: `"determinant"` (of the covariance), `"deviation"` (geometric
-      mean of the standard deviations) or `"condition"` (of the columns).
-    - `noise`: deviation of torque noise, one or one per joint, N·m or N; a hundredth of the limits
-      if None.
+    - `kind`: `"inverse-dynamics"` for regressions, `"closed-loop"` for `OEM`: information by the
+      sensitivities of the simulated loop, whose motion and torque must also keep the limits.
+    - `criterion`: the criterion to minimise: `"determinant"` (of the covariance), `"deviation"`
+      (geometric mean of the standard deviations) or `"condition"` (of the columns).
+    - `noise`: standard deviation of torque noise, one or one per joint, N·m or N; a hundredth of
+      the torque limits if None.
     - `start`: pose to start and end at, `(joints,)`; any if None.
-    - `tries`: number of random references. `starts`: number of the best that are improved.
+    - `tries`: number of random references. `starts`: how many of the best are improved.
       `rounds`: largest number of rounds.
     - `seed`: of the random references. `say`: called with progress.
 
-    **Raises:** `LimitsError` that names the limit that allows no motion; `FitError` for settings
-        that allow no reference.
+    **Raises:** `LimitsError` if a limit allows no motion; `FitError` for settings that allow no
+        reference.
     """
     design, centre = make_design(
         loop,
@@ -89,7 +90,9 @@ def optimal_excitation(
         if score < best_score:
             best, best_score = z, score
     if best is None:
-        raise FitError("no reference of finite information was found: raise tries, or hold some")
+        raise FitError(
+            "no reference with finite information was found: raise tries, or hold some parameters"
+        )
     return _report(design, best, best_score, rate)
 
 

@@ -26,10 +26,10 @@ class Excitation(AbstractShown):
     - `series`: the reference as a Fourier series; `reference()` samples it.
     - `std`: predicted standard deviations of the parameters `names`, for one period and the assumed
       torque noise.
-    - `margins`: remaining margin by limit and joint, in percent; for the workspace the value of
-      its function, usually in m; none is negative.
+    - `margins`: margin by limit and joint, in percent; for the workspace the value of its function,
+      usually in m. No margin is negative.
     - `score`: logarithm of the criterion, with parameters in units of their scales; for the
-      determinant, of the root that makes it a deviation.
+      determinant and p parameters, of det(covariance)^(1 / 2p), the size of one deviation.
     """
 
     loop: ClosedLoop
@@ -87,7 +87,7 @@ class Excitation(AbstractShown):
         lines = [
             self._head(),
             self.table().to_string(float_format=lambda x: f"{x:.3g}"),
-            "left of the limits, %:",
+            "margins to the limits, %:",
             self.margins.to_string(float_format=lambda x: f"{x:.3g}"),
         ]
         return "\n".join([*lines, *self.undetermined])
@@ -97,7 +97,7 @@ class Excitation(AbstractShown):
         return (
             f"<p>{html.escape(self._head())}</p>"
             f"{self.table().to_html(float_format=lambda x: f'{x:.3g}')}"
-            f"<p>left of the limits, %</p>{self.margins.to_html(float_format='%.3g')}{foot}"
+            f"<p>margins to the limits, %</p>{self.margins.to_html(float_format='%.3g')}{foot}"
         )
 
     def _head(self) -> str:

@@ -26,13 +26,13 @@ class ARFilter(eqx.Module):
     def from_reflection(
         cls, reflection: Float[np.ndarray, " order"], variance: float = 1.0
     ) -> "ARFilter":
-        """The filter of reflection coefficients; stable, since they are below one (Levinson 1947).
+        """The stable filter with reflection coefficients of magnitude below one (Levinson 1947).
 
-        **Raises:** `NoiseError` if one is not.
+        **Raises:** `NoiseError` if one is not below one.
         """
         reflection = np.asarray(reflection, dtype=float)
         if not np.all(np.abs(reflection) < 1):
-            raise NoiseError("a reflection coefficient of a stable filter is between -1 and 1")
+            raise NoiseError("reflection coefficients of a stable filter must be between -1 and 1")
         a = np.ones(1)
         for k in reflection:
             a = np.append(a, 0.0)
@@ -51,7 +51,7 @@ class ARFilter(eqx.Module):
 
     @property
     def reflection(self) -> Float[np.ndarray, " order"]:
-        """Reflection coefficients; the filter is stable where all are between -1 and 1."""
+        """Reflection coefficients; the filter is stable if all are between -1 and 1."""
         a, found = self.polynomial, []
         while len(a) > 1:
             k = a[-1]
@@ -70,7 +70,7 @@ class ARFilter(eqx.Module):
 
     @property
     def gain(self) -> float:
-        """Variance of the coloured noise over that of e; infinite where unstable."""
+        """Variance of the coloured noise over that of e; infinite if unstable."""
         reflection = self.reflection
         if not np.all(np.abs(reflection) < 1):
             return np.inf
@@ -81,7 +81,7 @@ class ARFilter(eqx.Module):
         return self.variance / np.abs(np.fft.fft(self.polynomial, size)) ** 2
 
     def whiten(self, x: Float[np.ndarray, "samples *axes"]) -> Float[np.ndarray, "samples *axes"]:
-        """A(z) x along the first axis; what came before the first sample counts as zero."""
+        """A(z) x along the first axis; samples before the first count as zero."""
         import scipy
 
         return np.asarray(
@@ -89,13 +89,13 @@ class ARFilter(eqx.Module):
         )
 
     def stabilised(self) -> "ARFilter":
-        """The stable filter of the same spectrum: poles are reflected into the unit circle."""
+        """The stable filter with the same spectrum: poles are reflected into the unit circle."""
         if self.stable:
             return self
         poles = np.roots(self.polynomial)
         outside = np.abs(poles) >= 1
         inside = np.where(outside, 1 / np.conj(poles), poles)
-        # On the circle itself noise would grow without bound; slightly inside it does not.
+        # Noise of a pole on the circle grows without bound, so poles are kept slightly inside.
         inside = inside * np.minimum(1.0, 0.999 / np.maximum(np.abs(inside), 1e-12))
         variance = self.variance / float(np.prod(np.abs(poles[outside]) ** 2))
         return ARFilter(np.real(np.poly(inside))[1:], variance)
@@ -121,7 +121,7 @@ class ARFilter(eqx.Module):
         **Arguments:**
 
         - `samples`: longest time constant of a pole.
-        - `series`: from which the filter was estimated.
+        - `series`: the series from which the filter was estimated.
         """
         poles = np.roots(self.polynomial)
         longest = np.exp(-1 / max(samples, 1e-3))
@@ -138,12 +138,12 @@ class ARFilter(eqx.Module):
 
 
 def check_series(series: Sequence[Float[np.ndarray, " _"]], order: int, what: str) -> None:
-    """Refuses residuals from which no noise filter of an order can be estimated.
+    """Checks that a noise filter of an order can be estimated from residuals.
 
     **Arguments:**
 
     - `series`: residuals, one array for each recording.
-    - `order`: the highest order asked for.
+    - `order`: the highest order.
     - `what`: the name of the output in messages.
 
     **Raises:** `NoiseError`.
@@ -153,14 +153,14 @@ def check_series(series: Sequence[Float[np.ndarray, " _"]], order: int, what: st
     for k, x in enumerate(series, start=1):
         if not np.isfinite(x).all():
             raise NoiseError(
-                f"the residual of {what} in recording {k} is not finite: the simulation failed "
-                "there, so estimate the parameters first"
+                f"the residual of {what} in recording {k} is not finite, because the simulation "
+                "failed: estimate the parameters first"
             )
     shortest = min(len(x) for x in series)
     if shortest <= order + 1:
         raise NoiseError(
-            f"a recording of {shortest} samples is shorter than the noise filter of {what}, whose "
-            f"order is {order}: leave it out, or lower the order"
+            f"a recording has {shortest} samples, too few for the noise filter of {what} of order "
+            f"{order}: leave it out, or lower the order"
         )
     total = sum(len(x) for x in series)
     if total - order * len(series) < 3 * (order + 1):
@@ -186,7 +186,7 @@ def fit_ar(
 ) -> ARFilter:
     """The AR filter of one joint's residuals over several recordings, by Burg's method.
 
-    Stable by construction, since every reflection coefficient is below one. Products across the
+    The filter is stable, because every reflection coefficient is below one. Products across the
     ends of recordings are left out.
 
     **Arguments:**
@@ -257,7 +257,7 @@ class Burg(eqx.Module):
 
     @classmethod
     def of(cls, series: Sequence[Float[np.ndarray, " _"]], most: int) -> "Burg":
-        """Orders 0..`most`, each recording in units of its own level."""
+        """Filters of orders 0..`most`, each recording in units of its own noise level."""
         forward = levelled([np.asarray(x, dtype=float) for x in series])
         backward = list(forward)
         a = np.ones(1)
@@ -279,7 +279,7 @@ class Burg(eqx.Module):
         return cls(found, floored, innovations, count)
 
     def orders(self, tested: bool, lags: int = 38) -> "pd.DataFrame":
-        """One row for each order; whiteness only where `tested`, since it is slow."""
+        """One row for each order; whiteness only if `tested`, because the test is slow."""
         import pandas as pd
 
         k = np.arange(len(self.variances))

@@ -1,4 +1,4 @@
-"""Noise of recorded torque without a model of the robot: from repeats, or above the motion."""
+"""Noise of recorded torque without a robot model, from repeats or from high frequencies."""
 
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -14,20 +14,21 @@ from ..signals.smoothing import low_pass
 Source = Literal["repeats", "above the motion"]
 Compared = Callable[[Sequence[Recording], Sequence[np.ndarray]], Sequence[np.ndarray]]
 
-# The low-pass of a motion has let go at this multiple of its cutoff. Towards half the sample rate
-# loggers have filters of their own.
+# Frequencies that are used, from this multiple of the cutoff, where the low-pass has decayed, up to
+# this share of half the sample rate, near which loggers have their own filters.
 _ABOVE, _UNTIL = 1.5, 0.9
-# Samples of a window of the spectrum, windows and frequencies that say something.
+# Samples of a window of the spectrum, and smallest numbers of windows and frequencies.
 _WINDOW, _WINDOWS, _BINS = 64, 6, 6
-# Rows of a difference that say something.
+# Smallest number of rows of a difference.
 _ROWS = 20
-# Log of the power in the lower half of the frequencies over that in the upper half, and standard
-# deviations of it, from which noise is not called white; a deviation that is larger tells nothing.
+# The test of whiteness uses the logarithm of the ratio of power in the lower half of the
+# frequencies to that in the upper half. Noise is not white if this exceeds the first number and so
+# many of its standard deviations; with a standard deviation above the third, there is no result.
 _COLOURED, _SURE, _UNSURE = 0.15, 2.0, 0.2
 
 
 class Level(eqx.Module):
-    """Deviation of the noise of a joint's torque as it is compared, and its 95 % interval.
+    """Standard deviation of the noise in a joint's compared torque, and its 95 % interval.
 
     - `value`, `low`, `high`: N·m or N.
     """
@@ -44,17 +45,17 @@ def above_motion(
     moving: Bool[np.ndarray, "samples joints"],
     share: float,
 ) -> tuple[Level | None, ...]:
-    """Noise by joint from the torque's spectrum above the motion, where noise is white there.
+    """Noise by joint from the torque's spectrum above the frequencies of the motion.
 
-    No rigid arm's torque is there, and none of friction's while a joint keeps its direction. What
-    is white above the motion's frequencies is taken to be so below them. Noise that is not is no
-    guide to lower frequencies, and None is returned.
+    A rigid arm has no torque at these frequencies; neither has friction while a joint keeps its
+    direction. Noise that is white above the motion's frequencies is assumed to be white below them.
+    If it is not white, it cannot be extrapolated, and None is returned.
 
     **Arguments:**
 
     - `cutoff`: frequency up to which the motion is known, Hz.
-    - `moving`: at which samples a joint moves without a turn nearby; windows of those are used.
-    - `share`: of the power of white noise that is left in what is compared.
+    - `moving`: samples at which a joint moves without a nearby reversal; their windows are used.
+    - `share`: share of the power of white noise that remains in the compared signals.
     """
     import scipy
 
@@ -62,7 +63,7 @@ def above_motion(
     used = (grid >= _ABOVE * cutoff) & (grid < _UNTIL * recording.rate / 2)
     if used.sum() < _BINS or recording.samples < 4 * _WINDOW:
         return (None,) * recording.joints
-    # Windows leak what is a thousand times as strong below.
+    # Otherwise the motion, a thousand times as strong, would leak into these frequencies.
     high = recording.tau - low_pass(recording.tau, recording.rate, cutoff)
     taper = np.asarray(scipy.signal.get_window("hann", _WINDOW))
     first = np.arange(0, recording.samples - _WINDOW + 1, _WINDOW // 2)
@@ -73,47 +74,47 @@ def above_motion(
 
 
 def _white(power: Float[np.ndarray, "windows bins"], share: float) -> Level | None:
-    """Level of white noise from its spectrum in windows; None where it is not white."""
+    """Level of white noise from its spectrum in windows; None if it is not white."""
     if len(power) < _WINDOWS:
         return None
     lower, upper = (part.mean(axis=1) for part in np.array_split(power, 2, axis=1))
     if min(lower.min(), upper.min()) <= 0:
         return None
-    # By the median over windows, since a step in one of them has a spectrum of its own.
+    # The median over windows is robust against a step in one of them.
     ratios = np.log(lower / upper)
     slope = np.median(ratios)
     chance = 1.25 * np.median(abs(ratios - slope)) / 0.674 / np.sqrt(0.6 * len(ratios))
     if chance > _UNSURE or (abs(slope) > _COLOURED and abs(slope) > _SURE * chance):
         return None
     mean, spread = share * power.mean(), _relative(power.mean(axis=1))
-    # What a colour that does not show yet may do at lower frequencies.
+    # Includes a possible slope of the spectrum that is too small to be detected.
     reach = 2 * np.hypot(spread, max(abs(slope), chance))
     value = np.sqrt(mean)
     return Level(value, value * np.exp(-reach / 2), value * np.exp(reach / 2), "above the motion")
 
 
 def _relative(x: Float[np.ndarray, " windows"]) -> float:
-    """Relative deviation of a mean of windows that overlap by half, bursts included."""
+    """Relative deviation of a mean of windows that overlap by half; allows for bursts."""
     return float(np.std(x) / (np.mean(x) * np.sqrt(0.6 * len(x))))
 
 
 def from_repeats(recordings: Recordings, compared: Compared) -> dict[str, tuple[Level | None, ...]]:
-    """Noise by joint of recordings that repeat a reference, by name, from their difference.
+    """Noise by joint of recordings with the same reference, by name, from their difference.
 
-    Half of the power of the difference is the noise of each, once what is linear in the difference
-    of the joint's motion is taken off. What else the robot does differently is part of it: no model
-    tells that from noise.
+    The part of the difference that is linear in the difference of the joint's motion is removed.
+    Half of the remaining power is the noise of each recording. It includes all other behaviour
+    that is not repeatable, which a model cannot distinguish from noise.
 
     **Arguments:**
 
-    - `compared`: what is compared of signals of two recordings, zero where nothing is.
+    - `compared`: gives the compared part of signals of two recordings, zero elsewhere.
     """
     named = {r.name: r for r in recordings}
     found: dict[str, tuple[Level | None, ...]] = {}
     for one, other in repeats_of(recordings):
         length = min(named[one].samples, named[other].samples)
         pair = [_first(named[name], length) for name in (one, other)]
-        # The same reference at other times of the clock is no sample for sample repeat.
+        # The recordings must have the same sample times relative to the start.
         if not np.allclose(*(r.time - r.time[0] for r in pair), rtol=0, atol=0.1 * pair[0].period):
             continue
         apart = []
@@ -135,7 +136,7 @@ def _first(r: Recording, samples: int) -> Recording:
 
 
 def _motion(r: Recording) -> tuple[Float[np.ndarray, "samples joints"], ...]:
-    """Position from where it begins, velocity and acceleration; with the encoder's noise."""
+    """Position relative to the first sample, velocity and acceleration, with encoder noise."""
     q = r.q - r.q[:1]
     v = np.gradient(q, r.period, axis=0)
     return q, v, np.gradient(v, r.period, axis=0)
@@ -146,12 +147,12 @@ def _of_difference(
 ) -> Level | None:
     there = torque != 0
     x, y = motion[there], torque[there]
-    # Copies of one recording say nothing.
+    # Copies of one recording carry no information.
     if len(y) < _ROWS:
         return None
     rest = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
     value = float(np.sqrt(np.sum(rest**2) / (2 * (len(rest) - x.shape[1]))))
-    # Frequencies that share the power: noise that follows itself has fewer than rows.
+    # Effective number of frequencies: coloured noise has fewer than rows.
     power = np.abs(np.fft.rfft(rest)) ** 2
     freedom = max(2 * float(np.sum(power)) ** 2 / max(float(np.sum(power**2)), 1e-300), 1.0)
     reach = 1.96 / np.sqrt(2 * freedom)

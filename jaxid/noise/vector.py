@@ -41,7 +41,7 @@ class VectorAR(eqx.Module):
 
     @property
     def radius(self) -> float:
-        """Largest modulus of a pole; noise stays bounded where it is below one."""
+        """Largest modulus of a pole; noise stays bounded if it is below one."""
         return float(np.abs(np.linalg.eigvals(self.companion)).max()) if self.order else 0.0
 
     @property
@@ -59,7 +59,7 @@ class VectorAR(eqx.Module):
     def whiten(
         self, x: Float[np.ndarray, "samples outputs"]
     ) -> Float[np.ndarray, "samples outputs"]:
-        """e of a noise; what came before the first sample counts as zero."""
+        """The innovations e of a noise; samples before the first count as zero."""
         import scipy
 
         taps = self.taps(self.order + 1)
@@ -79,12 +79,12 @@ class VectorAR(eqx.Module):
     ) -> Float[np.ndarray, "*shape outputs"]:
         """Stationary noise from the first sample on; samples are the last axis of `shape`.
 
-        **Raises:** `NoiseError` where the filter is not stable.
+        **Raises:** `NoiseError` if the filter is not stable.
         """
         if not self.stable:
             raise NoiseError(
-                "this noise filter is not stable, so its noise cannot be simulated: estimate it "
-                "by fit_var, which gives stable ones"
+                "this noise filter is not stable, so its noise cannot be simulated: estimate it by "
+                "fit_var, which gives stable filters"
             )
         settle = min(50_000, int(np.ceil(np.log(1e-4) / np.log(max(self.radius, 1e-3))))) + 1
         *some, samples = shape
@@ -118,7 +118,7 @@ def fit_var(
     - `series`: residuals, `(samples, outputs)` for each recording.
     - `order`: number of matrices; None to choose it by `criterion` over 0..`highest`.
 
-    **Raises:** `NoiseError` where the data do not allow it.
+    **Raises:** `NoiseError` if the data do not allow it.
     """
     series = levelled([np.asarray(x, float) for x in series])
     n = series[0].shape[1]
@@ -181,7 +181,7 @@ def _nuttall_strand(
     return found
 
 
-# Filters of each output, one of all outputs, or white noise.
+# A filter per output, one filter of all outputs, or white noise.
 Noise = Sequence[ARFilter] | VectorAR | None
 
 

@@ -28,7 +28,7 @@ def autocovariance(
 def levelled(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]:
     """Several series scaled to a common noise level.
 
-    Otherwise one recording with more noise would dominate.
+    Without scaling, a recording with more noise would dominate.
 
     **Arguments:**
 
@@ -38,7 +38,7 @@ def levelled(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]
 
 
 def levels(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]:
-    """Noise level of each series relative to that of all together; one for a series of zeros."""
+    """Noise level of each series relative to the overall level; one for a series of zeros."""
     power = [np.asarray(np.mean(np.square(x), axis=0)) for x in series]
     pooled = sum(len(x) * p for x, p in zip(series, power, strict=True)) / sum(map(len, series))
     ratio = [np.where(p > 0, p, 1.0) / np.where(p > 0, pooled, 1.0) for p in power]
@@ -53,7 +53,7 @@ def autocorrelation(
     **Arguments:**
 
     - `series`: residuals, `(samples,)` each.
-    - `lags`: how many beyond lag 0; 38 as in CAPTAIN's `acf` (Young 2011).
+    - `lags`: number of lags beyond 0; 38 as in CAPTAIN's `acf` (Young 2011).
     """
     covariance = autocovariance(series, lags)
     bound = 2 / np.sqrt(sum(len(x) for x in series))
@@ -81,7 +81,7 @@ def ljung_box(
 
     - `series`: residuals with mean zero, `(samples,)` each.
     - `lags`: number of lags.
-    - `fitted`: coefficients that were estimated from them.
+    - `fitted`: number of coefficients that were estimated from the residuals.
     """
     import scipy
 

@@ -31,9 +31,9 @@ def explore(
 ) -> "Explorer":
     """Sets an effect by sliders and shows the predictions of a fitted model with it.
 
-    Torque, residual and error follow from the linear system along the runs, in milliseconds. They
-    are exact for small effects; *refit in full* simulates the model with the effect and fits it.
-    Effects that separate drive and link, limits and delays are simulated, which takes longer.
+    The linear system along the runs gives torque, residual and error in milliseconds. They are
+    exact for small effects; *refit in full* simulates the model with the effect and fits it.
+    Transmissions, limits and delays are simulated, which takes longer.
 
     **Arguments:**
 
@@ -50,8 +50,7 @@ def explore(
         import ipywidgets  # noqa: F401
     except ImportError as error:
         raise ModelError(
-            "exploring needs widgets: pip install 'jaxid-robotics[notebook]', and start Jupyter "
-            "anew"
+            "explore needs widgets: pip install 'jaxid-robotics[notebook]', and start Jupyter anew"
         ) from error
     made = Explorer(fit, validate, catalogue)
     if effect is not None:
@@ -132,17 +131,17 @@ class Explorer:
         return self._picture.widget
 
     def choose(self, name: str, joint: int | None = None) -> None:
-        """Takes another effect, at no amplitude.
+        """Selects another effect, at zero amplitude.
 
         **Arguments:**
 
         - `name`: as in tables. `joint`: counted from 1; None for an effect of the whole arm.
 
-        **Raises:** `ModelError` where the catalogue does not offer it.
+        **Raises:** `ModelError` if the catalogue does not offer it.
         """
         of_name = {key: v for key, v in self._offered.items() if v[0][0] == name}
         if not any(j == joint for _, j, _ in (f for v in of_name.values() for f in v)):
-            raise ModelError(f"{effect_on(name, joint)} is not offered here: see the list")
+            raise ModelError(f"{effect_on(name, joint)} is not in the list of effects")
         self._name.value = next(k for k, v in of_name.items() if any(f[1] == joint for f in v))
         self._joint.value = joint if joint is not None else _ALL
 
@@ -159,7 +158,7 @@ class Explorer:
 
     def to_best(self) -> None:
         """Moves the sliders to the values that minimise the residual of the linear system."""
-        self._say("looking for the best values")
+        self._say("searching for the best values")
         self._sliders.move_to(self._what_if.best(self.effect))
 
     def refit(self) -> None:
@@ -180,7 +179,7 @@ class Explorer:
             self._full.disabled = False
 
     def _take(self, fit: Fit) -> None:
-        """Sets a fitted model: the effects on offer and its recordings."""
+        """Sets a fitted model, its list of effects and its recordings."""
         self.fit, self._at = fit, None
         self._what_if = WhatIf.of(fit, self._validate, self._catalogue)
         self._before = self._what_if.answer(None)
@@ -260,7 +259,7 @@ class Explorer:
         self._picture.follow(self._rest)
         self.milliseconds = 1e3 * (time.perf_counter() - began)
         said = f"answered in {self.milliseconds:.0f} ms"
-        self._say(said if self.answer.possible else "the loop runs away with these values")
+        self._say(said if self.answer.possible else "the loop diverges with these values")
 
     def _answered(self) -> None:
         assert self._at is not None
@@ -277,14 +276,14 @@ class Explorer:
         from IPython.display import display  # type: ignore[import-not-found]
 
         if self._picture is not None and self._picture.changed:
-            # Changes made before the figure is on the screen are lost, so it is made again.
+            # Changes are lost before the figure is on the screen, so it is made again.
             self._picture = None
             self._chosen_view()
         display(self.widget)
 
 
 def _table(before: Answer, now: Answer) -> str:
-    """Relative errors of the model as fitted and with the effect."""
+    """Relative errors of the fitted model without and with the effect."""
     joints = len(before.fitted_percent)
     head = "".join(f"<th>joint {j}</th>" for j in range(1, joints + 1))
     rows = [

@@ -1,4 +1,4 @@
-"""Figure of an explorer: torque and residual of one joint, as fitted and with an effect."""
+"""Figure of an explorer: torque and residual of one joint, without and with an effect."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ..display import figures
 
-# Drawn samples of a recording: enough for the columns of a screen, few enough to send quickly.
+# Drawn samples of a recording: enough for the resolution of a screen, and fast to transfer.
 _DRAWN = 1500
 # Which traces change with the effect.
 _PREDICTED, _REST = 2, 4
@@ -16,12 +16,11 @@ _PREDICTED, _REST = 2, 4
 class Picture:
     """A plotly widget of one recording and joint, two lines of which follow the effect.
 
-    A widget that is not on a screen yet loses changes made to it: `changed` is true if there were
-    any.
+    A widget that is not on the screen yet loses changes; `changed` tells whether there were any.
 
     **Arguments:**
 
-    - `time`: s. `measured`, `simulated`: the model as fitted, in `unit`.
+    - `time`: s. `measured`, `simulated`: signals of the recording and the fitted model, in `unit`.
     - `name`: name of the signal on its axis.
     """
 
@@ -79,7 +78,7 @@ class Picture:
 
         **Arguments:**
 
-        - `rest`: measured less predicted at all rows, in the unit of the signal.
+        - `rest`: measured minus predicted at all rows, in the unit of the signal.
         """
         drawn = rest[self._rows].astype(np.float32)
         self.changed = True
@@ -90,7 +89,7 @@ class Picture:
     def _drawn(
         self, time: np.ndarray, measured: np.ndarray, *others: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """Rows that are drawn, in single precision; the measured ones are kept."""
+        """Rows to draw, in single precision; the measured ones are cached."""
         self._rows = slice(None, None, max(1, -(-len(time) // _DRAWN)))
         found = [x[self._rows].astype(np.float32) for x in (time, measured, *others)]
         self._before = found[1]

@@ -11,7 +11,7 @@ from ..effects import AbstractEffect
 from ..parameters import read_values, write_values
 from ..simulation.loop import ClosedLoop
 
-# Ratio of the ends above which a slider is logarithmic, and its number of steps.
+# A slider is logarithmic above this ratio of its ends; number of steps.
 _LOG, _STEPS = 10.0, 400
 
 
@@ -44,7 +44,7 @@ class Sliders:
 
     def move_to(self, effect: AbstractEffect) -> None:
         """Sets the sliders to the values of another effect; their ranges are widened if needed."""
-        # One answer for all sliders together instead of one for each.
+        # The answer is computed once for all sliders instead of once for each.
         self._quiet = True
         try:
             for slider, value in zip(

@@ -41,7 +41,7 @@ def bag_table(source: str, path: Path, largest: int, refuse: Callable[[int], Exc
 
     **Arguments:**
 
-    - `largest`: bytes of messages about joints that are read; `refuse` makes the error for more.
+    - `largest`: most bytes of joint messages to read; `refuse` makes the error for more.
 
     **Raises:** `RecordingError` for a bag without such messages, or with contradictory ones;
         `MissingExtraError` without the extra `ros`.
@@ -65,7 +65,7 @@ def bag_table(source: str, path: Path, largest: int, refuse: Callable[[int], Exc
         raise problem(
             source,
             f"no topic has messages about joints, there are {listed or 'no topics'}",
-            "record sensor_msgs/msg/JointState, as /joint_states",
+            "record sensor_msgs/msg/JointState, for example /joint_states",
         )
     columns: dict[str, Stream] = {}
     about = []
@@ -97,7 +97,7 @@ def _messages(
             header = getattr(message, "header", None)
             stamp = 0 if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
             topic.fields.append(_fields(topic.kind, message))
-        except Exception as error:  # a damaged message raises nearly anything
+        except Exception as error:  # a damaged message may raise any exception
             raise problem(
                 source,
                 f"message {len(topic.stamps) + 1} of {connection.topic} cannot be read "
@@ -180,8 +180,8 @@ def _stamps(source: str, name: str, topic: _Topic) -> np.ndarray:
         return stamps
     warnings.warn(
         f"{source}: {blank} of {len(stamps)} messages of {name} have no stamp in their header, so "
-        "the times at which the bag received them are taken, which jitter and come late; stamp "
-        "them where they are sampled.",
+        "the times at which the bag received them are used, which jitter and are late; set the "
+        "stamps where messages are sampled.",
         JaxidWarning,
         stacklevel=8,
     )

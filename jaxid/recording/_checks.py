@@ -20,8 +20,8 @@ Lines = Sequence[int]
 
 _FEWEST_SAMPLES = 20
 _LARGEST = 1e30
-# Smallest jitter of times, in steps, that is examined, and the factor by which the motion must be
-# smoother on even times for a warning.
+# A warning needs at least this jitter of times, in steps, and a motion that is smoother on even
+# times by at least this factor.
 _JITTER, _ROUGHER = 0.05, 2.0
 
 
@@ -154,7 +154,7 @@ def validate(
     if len(shaped["time"]) < _FEWEST_SAMPLES:
         raise problem(
             source,
-            f"there are {len(shaped['time'])} samples",
+            f"it has only {len(shaped['time'])} samples",
             f"record at least {_FEWEST_SAMPLES}",
         )
     if accept.nan == "drop":
@@ -195,8 +195,8 @@ def _without_blanks(
     if not blank.any():
         return signals, lines
     warnings.warn(
-        f"{source}: {blank.sum()} of {len(blank)} samples are left out, since a signal is empty "
-        f"or not finite there, first at {place(int(np.argmax(blank)), lines)}.",
+        f"{source}: {blank.sum()} of {len(blank)} samples are left out, because a signal is empty "
+        f"or not finite, first at {place(int(np.argmax(blank)), lines)}.",
         JaxidWarning,
         stacklevel=5,
     )
@@ -209,7 +209,7 @@ def _even(source: str, time: Float64[np.ndarray, " samples"]) -> Float64[np.ndar
     number = np.arange(len(time))
     slope, first = np.polyfit(number, time, 1)
     if not slope > 0:
-        raise problem(source, "time does not grow over the recording", "give it in seconds")
+        raise problem(source, "time does not increase over the recording", "give it in seconds")
     return first + slope * number
 
 
@@ -232,9 +232,9 @@ def _steady(source: str, signals: Mapping[str, Float64[np.ndarray, "..."]]) -> N
     if rough[0] > _ROUGHER * rough[1]:
         warnings.warn(
             f"{source}: times jitter by {1e3 * jitter:.3g} ms about {1e3 * usual:.3g} ms, and "
-            f"positions are {rough[0] / rough[1]:.2g} times as smooth on even times, so these "
-            'are times at which a logger wrote, not at which the drive sampled; pass clock="even" '
-            "(--clock even), or record the drive's own times.",
+            f"positions are {rough[0] / rough[1]:.2g} times as smooth on even times, so these are "
+            "probably times of a logger, not those at which the drive sampled; pass "
+            'clock="even" (--clock even), or record the drive\'s own times.',
             JaxidWarning,
             stacklevel=5,
         )
@@ -272,8 +272,8 @@ def _shapes(
         if len(values) != len(time):
             raise problem(
                 source,
-                f"{signal} ({name}) has {len(values)} rows where time has {len(time)}",
-                f"give {signal} as (samples, joints), transposed if need be",
+                f"{signal} ({name}) has {len(values)} rows, but time has {len(time)}",
+                f"give {signal} as (samples, joints), transposed if necessary",
             )
         shaped[signal] = values
     joints = shaped["q"].shape[1]
@@ -281,7 +281,7 @@ def _shapes(
         if signal != "time" and values.shape[1] != joints:
             raise problem(
                 source,
-                f"q has {joints} joints and {signal} has {values.shape[1]}",
+                f"q has {joints} joints, but {signal} has {values.shape[1]}",
                 f"give one column of {signal} for each joint",
             )
     return shaped
@@ -313,7 +313,7 @@ def _bounded(
             source,
             f"{_label(labels, signal, int(joint), table.shape[1])} reaches {table[row, joint]:.3g} "
             f"in SI units at {place(int(row), lines)}",
-            "correct it, or name the unit it is in",
+            "correct it, or give its unit",
         )
 
 
@@ -339,7 +339,7 @@ def _increasing(
         row = int(np.argmax(too_long))
         raise problem(
             source,
-            f"{label} has a gap of {steps[row]:.4g} s before {place(row + 1, lines)}, where the "
+            f"{label} has a gap of {steps[row]:.4g} s before {place(row + 1, lines)}, but the "
             f"usual step is {np.median(steps):.4g} s",
             'split the recording there, or pass gaps="allow" (--gaps allow)',
         )
@@ -382,9 +382,9 @@ def _plausible(
     first, last = signals["time"][0], signals["time"][-1]
     if abs(first) > 100 * (last - first):
         warnings.warn(
-            f"{source}: time begins at {first:.10g} s, long before or after the recording: what "
-            "depends on time (friction that fades as a joint warms) counts from zero, so subtract "
-            "when the motion began.",
+            f"{source}: time begins at {first:.10g} s, far from zero: effects that depend on time "
+            "(such as friction that fades as a joint warms) assume that the motion begins at zero, "
+            "so subtract the time at which it began.",
             JaxidWarning,
             stacklevel=5,
         )

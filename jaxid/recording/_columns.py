@@ -148,7 +148,7 @@ def _default_names(source: str, table: Table, signal: str) -> list[str]:
         raise problem(
             source,
             f"there are both {signal} and {stem}{min(numbers)}",
-            f"keep one, or say which with columns={{'{signal}': ...}}",
+            f"keep one, or choose by columns={{'{signal}': ...}}",
         )
     if signal in here:
         return [signal]
@@ -230,7 +230,7 @@ def missing(source: str, table: Table, signal: str, name: str, beside: str = "")
         return problem(
             source,
             f"it is not clear which columns are {signal}: {table.unclear[signal]}",
-            f"say which: columns={{'{signal}': ...}}, --column {signal}=...",
+            f"name them: columns={{'{signal}': ...}}, --column {signal}=...",
         )
     if table.defaults and signal not in table.defaults and name == f"{signal}_1":
         what = {"q": "positions", "tau": "torques (effort)"}.get(signal, signal)
@@ -238,8 +238,8 @@ def missing(source: str, table: Table, signal: str, name: str, beside: str = "")
         return problem(
             source,
             f"no column has {what} of joints, there are {others}",
-            f"record them, or say which they are: columns={{'{signal}': ...}}, --column "
-            f"{signal}=... (jaxid.recording.contents_of lists what there is)",
+            f"record them, or name their columns: columns={{'{signal}': ...}}, --column "
+            f"{signal}=... (jaxid.recording.contents_of lists all columns)",
         )
     if name in table.refused:
         return problem(
@@ -247,7 +247,7 @@ def missing(source: str, table: Table, signal: str, name: str, beside: str = "")
             f"{brief(name)} is a {table.refused[name]}",
             "save plain arrays of numbers, in MATLAB by save(file, '-struct', 's')",
         )
-    what = f"column {brief(name)} is missing" + (f" though {brief(beside)} is there" * bool(beside))
+    what = f"column {brief(name)} is missing" + (f", but {brief(beside)} is there" * bool(beside))
     # A similar name that is valid is another signal, not a misspelling of this one.
     well_named = re.compile(rf"({'|'.join(SIGNALS)})(_\d+)?")
     what += near(name, (other for other in table.columns if not well_named.fullmatch(other)))
@@ -255,11 +255,11 @@ def missing(source: str, table: Table, signal: str, name: str, beside: str = "")
         struct, kind = next(iter(table.refused.items()))
         return problem(
             source,
-            f"{what}, the file holds only {brief(struct)}, a {kind}",
+            f"{what}, the file contains only {brief(struct)}, a {kind}",
             "save plain arrays of numbers, in MATLAB by save(file, '-struct', 's')",
         )
     return problem(
         source,
         f"{what}, there are {brief(list(table.columns))}",
-        f"rename it, or say which it is: columns={{'{signal}': ...}}, --column {signal}=...",
+        f"rename it, or name its column: columns={{'{signal}': ...}}, --column {signal}=...",
     )

@@ -51,7 +51,7 @@ def hdf5_table(path: Path, largest: int, refuse: Callable[[int], Exception]) -> 
 def _unreadable(dataset: Any) -> str:
     """Description of a dataset that cannot be a signal; empty for numbers."""
     if dataset.external or dataset.is_virtual:
-        return "dataset that lies in another file"
+        return "dataset in another file"
     if dataset.shape is None:
         return "dataset without data"
     if dataset.ndim > 2:

@@ -25,7 +25,7 @@ def by_joint(source: str, table: Table, told: Description) -> dict[str, list[str
     if joints is not None and not found:
         raise problem(
             source,
-            "its columns are not named by joint, so joints cannot be chosen",
+            "joints cannot be chosen, because its columns are not named by joint",
             "give columns in the order of the robot",
         )
     given = told.columns or {}
@@ -50,8 +50,8 @@ def by_joint(source: str, table: Table, told: Description) -> dict[str, list[str
             labels[signal] = [named[joint] for joint in joints]
         elif signal not in given and len(absent) < len(joints):
             warnings.warn(
-                f"{source}: {signal} is left out, since there is none of {', '.join(absent)}; give "
-                "joints= (joints in the file of --log) for those that have it.",
+                f"{source}: {signal} is left out, because {', '.join(absent)} does not have it; to "
+                "use it, give joints= (joints in the file of --log) without such joints.",
                 JaxidWarning,
                 stacklevel=6,
             )
@@ -65,8 +65,8 @@ def _say_order(
     left = list(dict.fromkeys(j for named in needed for j in named if j not in joints))
     if left:
         warnings.warn(
-            f"{source}: {', '.join(left)} is left out, since it has not both a position and a "
-            "torque.",
+            f"{source}: {', '.join(left)} is left out, because it does not have both a position "
+            "and a torque.",
             JaxidWarning,
             stacklevel=7,
         )
@@ -74,8 +74,8 @@ def _say_order(
     numbered = len({re.sub(r"\d+", "", joint) for joint in joints}) < 2
     if not table.ordered and not numbered:
         warnings.warn(
-            f"{source}: joints are taken in the order of their names, {', '.join(joints)}; give "
-            "joints= (joints in the file of --log) in the order of the robot.",
+            f"{source}: joints are in the order of their names, {', '.join(joints)}; give joints= "
+            "(joints in the file of --log) in the order of the robot.",
             JaxidWarning,
             stacklevel=7,
         )

@@ -136,7 +136,7 @@ def _table(source: str, frame: "pd.DataFrame", told: dict[str, Any]) -> Table:
         if len(listed) != values.shape[1]:
             raise problem(
                 source,
-                f"meta/info.json names {len(listed)} parts of {key}, which has {values.shape[1]}",
+                f"meta/info.json names {len(listed)} parts of {key}, but it has {values.shape[1]}",
                 "correct the names there",
             )
         columns |= {f"{key}.{n}": values[:, k] for k, n in enumerate(listed)}
@@ -156,7 +156,7 @@ def _names(given: Any) -> list[str]:
 
 
 def _time(columns: dict[str, Any], rate: float) -> Any:
-    """Times, from the frame numbers if they agree, since files keep only seven digits."""
+    """Times; from the frame numbers if these agree, because files keep only seven digits."""
     time = columns.get("timestamp")
     if time is None or rate <= 0 or "frame_index" not in columns:
         return time
@@ -169,7 +169,7 @@ def _defaults(names: dict[str, list[str]], columns: dict[str, Any]) -> dict[str,
     """Columns by signal and joint."""
     found: dict[str, dict[str, str]] = {}
     for signal, keys in _CALLED.items():
-        # The state may hold velocities and torques beside positions.
+        # The state may contain velocities and torques in addition to positions.
         for key in (*keys, *(("observation.state",) if signal in ("v", "tau") else ())):
             joints = _joints(names.get(key, []), signal, own=key in keys)
             if joints:

@@ -67,11 +67,11 @@ def _element(data: bytes, at: int, order: str) -> tuple[int, bytes, int]:
         # Up to four bytes are kept in the tag itself.
         kind, size = kind & 0xFFFF, kind >> 16
         if size > 4:
-            raise ValueError(f"a small element promises {size} bytes")
+            raise ValueError(f"a small element declares {size} bytes")
         return kind, data[at + 4 : at + 4 + size], at + 8
     content = data[at + 8 : at + 8 + size]
     if len(content) < size:
-        raise ValueError(f"a variable promises {size} bytes where {len(content)} are left")
+        raise ValueError(f"a variable declares {size} bytes, but {len(content)} are left")
     padding = 0 if kind == _COMPRESSED else -size % 8
     return kind, content, at + 8 + size + padding
 
@@ -111,14 +111,14 @@ def _matrix(data: bytes, order: str) -> tuple[str, np.ndarray | str]:
         return name, real + 1j * _numbers(data, at, order, shape)[0]
     # Whole numbers may be stored as integers, but fractions are never stored in an integer class.
     if not np.can_cast(real.dtype, _CLASSES[kind], "same_kind") and real.dtype.kind == "f":
-        raise ValueError(f"{name!r} holds fractions where its class is of integers")
+        raise ValueError(f"{name!r} contains fractions, but its class is of integers")
     return name, real.astype(_CLASSES[kind])
 
 
 def _expected(data: bytes, at: int, order: str, kind: int) -> tuple[bytes, int]:
     found, content, after = _element(data, at, order)
     if found != kind:
-        raise ValueError(f"there is an element of type {found} where {kind} is expected")
+        raise ValueError(f"there is an element of type {found}, but {kind} is expected")
     return content, after
 
 
@@ -128,7 +128,7 @@ def _numbers(data: bytes, at: int, order: str, shape: tuple[int, ...]) -> tuple[
         raise ValueError(f"numbers are of type {stored}, which does not exist")
     values = np.frombuffer(content, f"{order}{_STORED[stored]}")
     if len(values) != math.prod(shape):
-        raise ValueError(f"{len(values)} numbers are there where the shape is {shape}")
+        raise ValueError(f"there are {len(values)} numbers, but the shape is {shape}")
     return values.reshape(shape, order="F"), after
 
 

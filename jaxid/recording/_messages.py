@@ -14,7 +14,7 @@ class Kind(eqx.Module):
     """A message type: its fields by joint, and the signals that they may supply.
 
     - `fields`: returns the fields of one message; those without values are empty.
-    - `roles`: fields by signal, the preferred first.
+    - `roles`: fields by signal, the preferred field first.
     """
 
     fields: Callable[[Any], Iterator[Field]]

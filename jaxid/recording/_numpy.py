@@ -17,14 +17,14 @@ def npz_table(source: str, data: bytes, largest: int, refuse: Callable[[int], Ex
 
     **Arguments:**
 
-    - `largest`: bytes to which they may unpack; `refuse` makes the error for more.
+    - `largest`: most unpacked bytes; `refuse` makes the error for more.
 
     **Raises:** `RecordingError` for an array of objects; zipfile's exceptions for a damaged file.
     """
     if data.startswith(np.lib.format.MAGIC_PREFIX):
         npy(data)
         raise problem(
-            source, "holds one bare array", "save named arrays with np.savez(file, time=..., q=...)"
+            source, "has one unnamed array", "save named arrays by np.savez(file, time=..., q=...)"
         )
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = archive.infolist()

@@ -62,16 +62,16 @@ def read(
 
     **Arguments:**
 
-    - `paths`: one for each recording, which takes its name: `.csv`, `.tsv`, `.txt` (or these
+    - `paths`: one for each recording, which gets the file's name: `.csv`, `.tsv`, `.txt` (or these
       `.gz`), `.parquet`, `.mat`, `.npz`, `.h5`, `.hdf5`, a bag (its folder, `.mcap` or `.db3`); or
       the folder of a LeRobot dataset for all of its episodes, `FOLDER/episode_3` for one.
     - `columns`: maps signals to the file's names, e.g. `{"time": "t", "q": ["pos1", "pos2"]}`. A
-      name may be a product, `"gain*current"`, and `time` the period, as a number or the name of
-      one. Default: `time`, `q_1..n`, `tau_1..n` and, if present, `q_ref_1..n`, `v_1..n`,
-      `tau_ff_1..n`, `v_ref_1..n`, `kp_1..n`, `kd_1..n`, `supply_1..n`, `on_1..n`, of which the last
-      five may be numbers instead of names; also `q`, `tau`, ... for all joints at once. Files of
-      the EMPS benchmark are recognised, and joint states of bags and datasets. Other columns are
-      ignored.
+      name may be a product, `"gain*current"`. `time` may be the sample period, as a number or the
+      name of one. By default the columns are `time`, `q_1..n`, `tau_1..n` and, if present,
+      `q_ref_1..n`, `v_1..n`, `tau_ff_1..n`, `v_ref_1..n`, `kp_1..n`, `kd_1..n`, `supply_1..n`,
+      `on_1..n`; or `q`, `tau`, ... for all joints at once. The last five may be numbers instead of
+      names. Files of the EMPS benchmark and joint states of bags and datasets are recognised.
+      Other columns are ignored.
     - `joints`: names of joints in the order of the robot, if a bag or dataset has them; by default
       all of them, sorted by name.
     - `units`: unit by signal, e.g. `{"q": "deg", "v": "deg/s", "tau": "N·mm", "time": "ms"}`; SI by
@@ -151,7 +151,7 @@ def _tables(path: Path, largest: int) -> Iterator[tuple[str, str, Table]]:
 
 @contextlib.contextmanager
 def _said(source: str, path: Path) -> Iterator[None]:
-    """Converts the exceptions of parsers to a one-sentence error."""
+    """Converts the exceptions of parsers to an error of one sentence."""
     try:
         yield
     except (JaxidError, GeneratorExit):
@@ -160,7 +160,7 @@ def _said(source: str, path: Path) -> Iterator[None]:
         kind = "".join(path.suffixes[-1 - (path.suffix.lower() == ".gz") :]) or "a folder of logs"
         raise problem(
             source,
-            f"cannot be read as {kind}, it is damaged, cut off or of another kind "
+            f"cannot be read as {kind}, it is damaged, truncated or of another kind "
             f"({type(error).__name__}: {error})",
             "write or copy the file again",
         ) from error
@@ -236,8 +236,8 @@ def _there(source: str, path: Path) -> int:
 def _too_large(source: str, size: int, largest: int) -> RecordingError:
     return problem(
         source,
-        f"holds at least {size} bytes unpacked, more than the {largest} that are read",
-        "cut it into shorter recordings, or pass read(..., largest=) if it is yours",
+        f"has at least {size} bytes unpacked, more than the limit of {largest}",
+        "cut it into shorter recordings, or pass read(..., largest=) if you trust it",
     )
 
 
@@ -266,12 +266,12 @@ def _text(source: str, data: bytes, largest: int) -> Table:
         if (cells := len(_cells(line, delimiter))) != len(names):
             raise problem(
                 source,
-                f"line {number} has {cells} cells where the header has {len(names)}",
+                f"line {number} has {cells} cells, but the header has {len(names)}",
                 "complete or remove that line",
             )
     rows = [line for _, line in numbered]
     if not rows:
-        raise problem(source, "there is a header and no rows", "record or copy it again")
+        raise problem(source, "there is a header but no rows", "record or copy it again")
     frame = pd.read_csv(
         io.StringIO("".join(rows)),
         sep=delimiter or r"\s+",
@@ -280,7 +280,7 @@ def _text(source: str, data: bytes, largest: int) -> Table:
         low_memory=False,
     )
     if len(frame) != len(rows):
-        raise problem(source, "a quoted cell runs over several rows", "remove its quotes")
+        raise problem(source, "a quoted cell spans several rows", "remove its quotes")
     at = tuple(number for number, _ in numbered)
     return from_frame(source, frame.set_axis(names, axis="columns"), at)
 
@@ -309,8 +309,8 @@ def _header(source: str, lines: Numbered) -> tuple[list[str], str, Numbered]:
     else:
         raise problem(
             source,
-            "there is no header, the first line holds numbers only",
-            "put a first line of names there, such as time,q_1,tau_1",
+            "there is no header, the first line has numbers only",
+            "add a first line of names, such as time,q_1,tau_1",
         )
     return [name.strip() for name in _cells(header, delimiter)], delimiter, rows
 
@@ -354,7 +354,7 @@ def _mat(source: str, data: bytes, largest: int) -> Table:
         listed = list(variables(data, order, largest, lambda n: _too_large(source, n, largest)))
     unique(source, [name for name, _ in listed])
     refused = {name: f"{kind} variable" for name, kind in listed if isinstance(kind, str)}
-    # MATLAB has no 1-d arrays: a vector comes as one row or one column.
+    # MATLAB has no 1-d arrays: a vector is one row or one column.
     return Table(
         {n: x.ravel() if 1 in x.shape else x for n, x in listed if not isinstance(x, str)}, refused
     )

@@ -203,7 +203,7 @@ class Recording(eqx.Module):
 
         - `start_s`, `stop_s`: times, s; None for the recording's own start or end.
 
-        **Raises:** `RecordingError` when the window holds fewer than two samples.
+        **Raises:** `RecordingError` if the window contains fewer than two samples.
         """
         start = 0 if start_s is None else np.searchsorted(self.time, start_s)
         stop = self.samples if stop_s is None else np.searchsorted(self.time, stop_s)
@@ -250,13 +250,13 @@ class Recordings(eqx.Module):
 
     @classmethod
     def of(cls, recordings: "Recording | Recordings | Iterable[Recording]") -> "Recordings":
-        """Recordings from one, or from several; a repeated name gets a number.
+        """Recordings from one or several recordings; a repeated name gets a number.
 
         **Arguments:**
 
         - `recordings`: a `Recording`, a `Recordings`, or an iterable of `Recording`.
 
-        **Raises:** `RecordingError` when there are none, or their numbers of joints differ.
+        **Raises:** `RecordingError` if there are none, or their numbers of joints differ.
         """
         if isinstance(recordings, Recordings):
             return recordings
@@ -271,9 +271,9 @@ class Recordings(eqx.Module):
             if recording.joints != several[0].joints:
                 raise problem(
                     recording.name,
-                    f"it has {recording.joints} joints where {several[0].name} has "
+                    f"it has {recording.joints} joints, but {several[0].name} has "
                     f"{several[0].joints}",
-                    "read recordings of different robots apart",
+                    "read recordings of different robots separately",
                 )
         names = _distinct([recording.name for recording in several])
         return cls(tuple(map(_renamed, several, names)))
@@ -298,9 +298,9 @@ class Recordings(eqx.Module):
             if abs(other.period / first.period - 1) > 0.01:
                 raise problem(
                     other.name,
-                    f"it has {other.rate:.4g} samples a second where {first.name} has "
-                    f"{first.rate:.4g}, and a noise filter holds for one rate",
-                    "resample one of them, or use them apart",
+                    f"it has {other.rate:.4g} samples per second, but {first.name} has "
+                    f"{first.rate:.4g}, and a noise filter is valid for one rate only",
+                    "resample one of them, or use them separately",
                 )
         return first.period
 

@@ -1,11 +1,11 @@
-"""Steps of which readings are multiples: encoder counts, or the digits of a file."""
+"""The resolution of readings: encoder counts, or the digits of a file."""
 
 import numpy as np
 from jaxtyping import Float64
 
 
 def quantum(q: Float64[np.ndarray, "samples joints"]) -> Float64[np.ndarray, " joints"] | None:
-    """The encoder step of each joint, or None if one of them shows none.
+    """The encoder step of each joint, or None if it is not visible for some joint.
 
     **Arguments:**
 
@@ -25,7 +25,7 @@ def is_decimal(step: float) -> bool:
 
 
 def step_of(x: Float64[np.ndarray, " samples"]) -> float | None:
-    """The step of which all differences of a signal are whole multiples, or None without one.
+    """The step such that all differences of a signal are multiples of it; None without one.
 
     **Arguments:**
 
@@ -42,8 +42,8 @@ def step_of(x: Float64[np.ndarray, " samples"]) -> float | None:
         while upto < moves.size:
             upto = int(np.searchsorted(moves, max(30 * moves[upto], 30 * step), side="right"))
             counts = np.round(moves[:upto] / step)
-            # A hundredth of a count is far above rounding, and the probability that 20 moves all
-            # meet it by chance is 50**-20.
+            # A hundredth of a count is far above rounding. The probability that 20 moves are all
+            # within it by chance is 50**-20.
             if not (np.abs(moves[:upto] / step - counts) < 0.01).all():
                 return None
             step = (

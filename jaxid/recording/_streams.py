@@ -26,7 +26,7 @@ class Stream(eqx.Module):
 def aligned(
     source: str, columns: Mapping[str, object], labels: Mapping[str, Sequence[str]]
 ) -> dict[str, object]:
-    """Columns in which the streams that signals use are resampled to the first position's times.
+    """Columns with the signals' streams resampled to the times of the first position.
 
     Streams with other stamps are interpolated linearly, and are empty inside their gaps. Samples
     before the start or after the end of any stream are left out.
@@ -69,10 +69,10 @@ def aligned(
 
 
 def _in_order(source: str, stream: Stream) -> Stream:
-    """The stream sorted by its stamps, if messages only overtook each other in transit."""
+    """The stream sorted by its stamps, if messages only arrived in another order."""
     steps = np.diff(stream.stamps)
     back = -int(steps.min(initial=0))
-    # A clock that was set back is a different fault, which the checks of times refuse.
+    # A clock that was set back is a different fault, which the checks of times report.
     if back <= 0 or back > _LATE * np.median(np.abs(steps)):
         return stream
     order = np.argsort(stream.stamps, kind="stable")
@@ -98,7 +98,7 @@ def _say(source: str, base: Stream, others: Mapping[str, Stream]) -> None:
     there = sorted({rate(stream) for stream in others.values()})
     warnings.warn(
         f"{source}: {', '.join(there)} has other stamps than {rate(base)} and is interpolated at "
-        "its times; record both at one rate where torque must follow position to the sample.",
+        "its times; record both at one rate if they must be aligned to the sample.",
         JaxidWarning,
         stacklevel=7,
     )

@@ -44,7 +44,7 @@ def from_frame(source: str, frame: "pd.DataFrame", lines: tuple[int, ...] = ()) 
 
 
 def unique(source: str, names: Sequence[str]) -> None:
-    """Raises `RecordingError` when a name that is not empty appears twice."""
+    """Raises `RecordingError` if a name that is not empty appears twice."""
     seen = set()
     for name in filter(None, names):
         if name in seen:

@@ -27,9 +27,9 @@ def frame_of(source: str, table: object) -> "pd.DataFrame":
     if not hasattr(table, "__arrow_c_stream__"):
         raise problem(
             source,
-            f"{brief(table)} is no table",
+            f"{brief(table)} is not a table",
             "give a pandas DataFrame or an Arrow table, or use Recording.from_arrays",
         )
     arrow = require("pyarrow", "parquet")
-    # The metadata of pandas could turn a column into an index and so hide it.
+    # The metadata of pandas could turn a column into an index, which would hide it.
     return arrow.table(table).to_pandas(ignore_metadata=True)

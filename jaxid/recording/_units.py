@@ -21,7 +21,7 @@ _POSITION = {
 }
 _VELOCITY = {f"{unit}/s": factor for unit, factor in _POSITION.items()} | {"rpm": math.pi / 30}
 _VOLTAGE = {"V": 1.0, "mV": 1e-3}
-# A drive that is commanded by voltage has a voltage in place of a torque.
+# A drive that is commanded by voltage has a voltage instead of a torque.
 _TORQUE = {"Nm": 1.0, "mNm": 1e-3, "Nmm": 1e-3, "kNm": 1e3, "N": 1.0, "kN": 1e3} | _VOLTAGE
 _GAIN = {"1": 1.0}
 
@@ -39,7 +39,7 @@ SIGNALS: Mapping[str, Mapping[str, float]] = {
     "supply": _VOLTAGE,
     "on": {"1": 1.0},
 }
-# Signals that a drive is commanded or supplied with at a sample, and that hold until the next.
+# Commands and supply voltages of a drive; each value is constant until the next sample.
 HELD = ("v_ref", "kp", "kd", "supply", "on")
 
 # Signals of the same instrument have the same unit by default.

@@ -22,7 +22,7 @@ def settings(story: Discovery) -> Markup:
         ("effects at the end", ", ".join(_effects(story)) or "none"),
         ("method of the last fit", repr(story.fit.method)),
         ("significance", f"{story.diagnosis.significance:g}"),
-        ("took", f"{story.seconds:.0f} s"),
+        ("duration", f"{story.seconds:.0f} s"),
         ("machine", platform.platform()),
         ("Python", platform.python_version()),
         *((package, _version(package)) for package in packages),
@@ -32,15 +32,15 @@ def settings(story: Discovery) -> Markup:
     held = story.steps[0].held_out
     if held is not None:
         recordings += [["held out", *_recording(r)] for r in held.recordings]
-    columns = ["used", "recording", "samples", "duration, s", "rate, Hz", "SHA-256 of its numbers"]
+    columns = ["used", "recording", "samples", "duration, s", "rate, Hz", "SHA-256 of its samples"]
     told = json.dumps(_plain(story.to_dict()), indent=1, ensure_ascii=False)
     # The element scrolls, so it must be reachable by keyboard.
     whole = tag("pre", told, tabindex="0", role="region", aria_label="the story as JSON")
-    said = join("The story as ", tag("code", "jaxid discover --json"), " writes it")
+    said = join("The story in the JSON format of ", tag("code", "jaxid discover --json"))
     return section(
-        "To do it again",
+        "How to reproduce this result",
         table(columns, recordings, "recordings"),
-        details("How far the recordings reach", _reach(story)),
+        details("Ranges of the recordings", _reach(story)),
         details("Settings and versions", table(["setting", "value"], rows, "settings, versions")),
         details(said, whole, class_="raw"),
     )
@@ -61,7 +61,9 @@ def _reach(story: Discovery) -> Markup:
         for j in range(len(limits.low))
     ]
     columns = ["joint", "position", "speed up to", "acceleration up to", "torque up to"]
-    return table(columns, rows, "ranges of the fitted recordings: beyond them nothing was seen")
+    return table(
+        columns, rows, "ranges of the fitted recordings; the model is untested outside them"
+    )
 
 
 def _range(low: float, high: float, unit: str) -> str:

@@ -23,7 +23,7 @@ class Beside:
 
     @staticmethod
     def of(story: Discovery) -> "Beside":
-        """The models of a story; comparisons that the story does not contain are simulated now."""
+        """The models of a story; comparisons that the story does not contain are simulated."""
         first, last = story.steps[0], story.steps[-1]
         unseen = all(step.held_out is not None for step in story.steps)
         before = _compared(first, unseen)

@@ -20,7 +20,7 @@ def _curve(story: Discovery, effect: AbstractEffect) -> Content:
     try:
         curve = story.curve(effect)
     except JaxidError as error:
-        return tag("p", f"{_upper(effect.spoken())} is not drawn: {error}.")
+        return tag("p", f"No curve of {effect.spoken()} can be drawn: {error}.")
     times = ", times the sign of velocity," if curve.signed else ""
     part = f" It shows {100 * curve.share:.0f} % of the effect's torque." * (curve.share < 0.98)
     cloud = "" if curve.cloud is None else " over the residual of the model without it"

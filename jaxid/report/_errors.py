@@ -16,8 +16,8 @@ from ._models import where_table
 from ._signals import misfits
 
 LAGS = 38
-# Ratio of error to noise floor below which a joint counts as described by the model: an excess of
-# a tenth is visible in a figure.
+# A joint counts as described by the model below this ratio of error to noise floor; a larger error
+# is visible in a figure.
 NEAR = 1.1
 
 
@@ -32,9 +32,9 @@ def errors(beside: Beside) -> Markup:
     steps = [step.label for step in story.steps]
     columns = ["recording", "joint", *steps, "noise floor", "last over floor"]
     said = (
-        "Norm of measured less simulated over norm of measured, in %, step by step. The noise "
-        "floor is what a model without any mistake would leave, as estimated on the fitted "
-        f"recordings. A ratio below {NEAR:g} means that hardly more than noise is left."
+        "Norm of measured minus simulated signal over norm of measured signal, in %, for each "
+        "step. The noise floor is the error that a perfect model would leave, as estimated on the "
+        f"fitted recordings. A ratio below {NEAR:g} means that the residual is almost only noise."
     )
     shown = table(columns, rows, "relative error in % by recording, joint and step")
     return section("All recordings, joints and steps", tag("p", said), shown)
@@ -68,16 +68,17 @@ def rest(beside: Beside) -> Markup:
         "autocorrelations out of bounds",
     ]
     said = (
-        f"Of {LAGS} autocorrelations of white noise {0.05 * LAGS:.0f} are out of their bounds. "
-        "They are taken once the noise filter of the fit is taken out of the residual."
+        "The autocorrelations are those of the residual whitened by the noise filter of the fit. "
+        f"Of {LAGS} autocorrelations of white noise, {0.05 * LAGS:.0f} are expected outside the "
+        "bounds."
     )
-    pieces += [table(columns, _failures(beside), "what the final model leaves"), tag("p", said)]
+    pieces += [table(columns, _failures(beside), "residual of the final model"), tag("p", said)]
     if story.diagnosis.depends_on():
         pieces += [
             against(held, story.diagnosis.where[0], "the final model"),
             where_table(story.diagnosis),
         ]
-    return section("Where it still fails", *pieces)
+    return section("Where the model still fails", *pieces)
 
 
 def _verdict(beside: Beside) -> Content:
@@ -88,15 +89,13 @@ def _verdict(beside: Beside) -> Content:
     ]
     left = beside.story.diagnosis.depends_on()
     if not found and not left:
-        return (
-            "Nowhere that these recordings show: every joint is left with hardly more than noise."
-        )
+        return "Nowhere in these recordings: the residual of every joint is almost only noise."
     if not found:
         return (
-            "Every joint is left with hardly more than noise, but what is left still depends on a "
+            "The residual of every joint is almost only noise, but it still depends on a "
             "coordinate:"
         )
-    return f"More than noise is left of {'; of '.join(found)}."
+    return f"The residual is larger than the noise for {'; for '.join(found)}."
 
 
 def _joints(numbers: np.ndarray) -> str:
@@ -129,7 +128,7 @@ def _outside(beside: Beside, residual: np.ndarray) -> list[int]:
     """How many autocorrelations of each joint's innovations are out of their bounds."""
     filters = beside.story.diagnosis.noise
     mask = np.ones((1, len(residual)), bool)
-    # The filter has nothing to go by in its first rows, which are zero.
+    # The filter has no past samples for its first rows, which are zero.
     start = max(filt.order for filt in filters)
     counts = []
     for column in whitened(residual[None], filters, mask)[0, start:].T:
@@ -166,8 +165,8 @@ def against(held: Comparison, where: Verdict, model: str) -> Markup:
     )
     on = name if curve.coordinate == "t" else f"the {name}"
     caption = (
-        f"What {model} leaves of joint {joint}'s {held.signal}{signed}, against {on}. A "
-        "model that lacks nothing leaves a flat line. The line is the mean in stretches of equal "
-        "count, the band two standard errors of independent samples."
+        f"Residual of {model} in joint {joint}'s {held.signal}{signed}, against {on}. The line "
+        "is the mean in bins of equal count; it is flat if the model is complete. The band is "
+        "two standard errors for independent samples."
     )
     return figure(drawn, caption)

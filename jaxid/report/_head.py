@@ -31,9 +31,9 @@ def _asked(story: Discovery) -> Markup:
     judged = (
         "no recording was held out"
         if first.held_out is None
-        else f"judged on {_listed(first.held_out.recordings.names)}, which no fit has seen"
+        else f"tested on held-out {_listed(first.held_out.recordings.names)}"
     )
-    said = f"Asked: which physical effect does this model lack? Fitted to {fitted}; {judged}."
+    said = f"Question: which physical effect does this model lack? Fitted to {fitted}; {judged}."
     return tag("p", said, class_="lead")
 
 

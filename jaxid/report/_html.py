@@ -42,13 +42,13 @@ def join(*content: Content) -> Markup:
 def table(
     columns: Sequence[str], rows: Sequence[Sequence[Content]], caption: str | None = None
 ) -> Markup:
-    """A table with columns that sort on a click; displayed numbers are rounded, sorting is not."""
+    """A table whose columns sort on a click, by the numbers before rounding."""
     buttons = (tag("button", name, type="button") for name in columns)
     head = tag("tr", *(tag("th", button, scope="col") for button in buttons))
     body = [tag("tr", *(_cell(value) for value in row)) for row in rows]
     title = None if caption is None else tag("caption", caption)
     whole = tag("table", title, tag("thead", head), tag("tbody", *body))
-    # A wide table scrolls in its own box, so that a narrow page does not; the box takes the focus.
+    # A wide table scrolls in its own box instead of the page; the box can have the focus.
     return tag("div", whole, class_="scroll", tabindex="0", role="region", aria_label=caption)
 
 
@@ -73,7 +73,7 @@ def bar(shown: Content, value: float, share: float) -> Cell:
 
 
 def number(value: float) -> str:
-    """A number formatted with four digits; a dash if there is none."""
+    """A number formatted with four digits; a dash for NaN."""
     if not math.isfinite(value):
         return "–" if math.isnan(value) else ("∞" if value > 0 else "−∞")
     return f"{value:.4g}".replace("-", "−")
@@ -100,7 +100,7 @@ def probability(p: float) -> str:
 
 
 def details(summary: Content, *content: Content, class_: str | None = None) -> Markup:
-    """Collapsed content for some readers; it is printed unless it is `raw`."""
+    """Content that is collapsed on the screen; it is printed unless its class is `raw`."""
     return tag("details", tag("summary", summary), *content, class_=class_)
 
 
@@ -130,7 +130,7 @@ def figure(drawn: go.Figure, caption: Content, linked: bool = False) -> Markup:
 
     **Arguments:**
 
-    - `linked`: whether it shares its stretch of time with others, which keys and buttons move.
+    - `linked`: whether it shares its time range, set by keys and buttons, with other figures.
     """
     layout: Any = drawn.layout
     height = int(layout.height or 400)

@@ -20,7 +20,7 @@ def models(story: Discovery) -> Markup:
         pieces += [tag("h3", step.label), tag("p", _reason(before.diagnosis, step))]
         pieces.append(_alike(step))
     for name, joint in story.removed:
-        said = f"{effect_on(name, joint)} was added and later found not to be needed."
+        said = f"{effect_on(name, joint)} was added and removed later, because it is not needed."
         pieces.append(tag("p", said))
     for step in story.steps:
         if step.diagnosis is not None:
@@ -42,11 +42,11 @@ def _weights(story: Discovery) -> Markup:
         for m in story.considered[:SHOWN]
     ]
     said = (
-        "The weight is the probability of a model among all that were looked at. It follows from "
-        "the score: exp(-score/2), divided by the sum over all models. Held-out recordings do not "
-        "enter it. A difference of ten in score is decisive."
+        "The weight is the probability of a model among all that were examined: exp(-score/2), "
+        "divided by the sum over all models. Held-out recordings do not enter the score. A "
+        "difference of ten in score is decisive."
     )
-    columns = ["model", "weight", "behind the best", "fitted, %", "held out, %", "fit"]
+    columns = ["model", "weight", "score above the best", "fitted, %", "held out, %", "fit"]
     more = len(story.considered) - SHOWN
     which = "all of them" if more <= 0 else f"the best {SHOWN} of {len(story.considered)}"
     shown = table(columns, rows, f"models by weight ({which}); errors in % by joint")
@@ -67,19 +67,19 @@ def _reason(diagnosis: Diagnosis | None, step: Step) -> str:
     chosen = next((v for v in ranked if v.key == key), None)
     others = [v for v in ranked if v.key != key]
     if chosen is None or not others:
-        return "It was chosen by its refit."
+        return "It was chosen by the score of its refit."
     rival = others[0]
     said = (
         f"{_upper(effect_on(chosen.hypothesis.effect.spoken(), key[1]))} explains "
-        f"{_share(diagnosis, chosen)} of what the model before it left (whitened), noise "
-        f"{100 * diagnosis.gram.count / diagnosis.gram.rest:.3g} %. The best other effect is "
-        f"{effect_on(rival.hypothesis.effect.spoken(), rival.hypothesis.joint)} with "
-        f"{_share(diagnosis, rival)}; what the two do to the torque correlates by "
+        f"{_share(diagnosis, chosen)} of the whitened residual of the previous model; noise is "
+        f"{100 * diagnosis.gram.count / diagnosis.gram.rest:.3g} % of it. The best other effect, "
+        f"{effect_on(rival.hypothesis.effect.spoken(), rival.hypothesis.joint)}, explains "
+        f"{_share(diagnosis, rival)}. The torques of the two have a correlation of "
         f"{abs(diagnosis.correlation(chosen, rival)):.2f}."
     )
     if chosen.evidence > rival.evidence:
         return said
-    return f"{said} That one was ahead before both were fitted, and behind after it."
+    return f"{said} The other effect was ahead before both were fitted, and behind afterwards."
 
 
 def _upper(words: str) -> str:
@@ -93,8 +93,8 @@ def _share(diagnosis: Diagnosis, verdict: Verdict) -> str:
 def _alike(step: Step) -> Markup:
     if step.alike:
         others = ", ".join(effect_on(n, j) for n, j in step.alike)
-        return tag("p", f"These recordings cannot tell it from {others}.", class_="note")
-    return tag("p", "No other effect of the catalogue describes these recordings as well.")
+        return tag("p", f"These recordings cannot distinguish it from {others}.", class_="note")
+    return tag("p", "No other effect of the catalogue describes these recordings equally well.")
 
 
 def _screened(diagnosis: Diagnosis, step: Step) -> Markup:
@@ -130,10 +130,10 @@ def _screened(diagnosis: Diagnosis, step: Step) -> Markup:
     ]
     said = (
         "Every effect of the catalogue at its best setting, predicted from one fit. p-values are "
-        f"corrected for {diagnosis.tests:.0f} independent tests; below {diagnosis.significance:g} "
-        "something counts as missing. Evidence is the whitened squared error that an effect takes "
-        "away, less log(samples) for each amplitude. Likeness is the correlation with what the "
-        "first effect of the list does to the torque."
+        f"corrected for {diagnosis.tests:.0f} independent tests; an effect counts as missing below "
+        f"{diagnosis.significance:g}. Evidence is the whitened squared error that an effect "
+        "explains, minus log(samples) for each amplitude. Likeness is the correlation of its "
+        "torque with that of the first effect of the list."
     )
     title = "What each effect would explain beyond " + (
         "the starting model" if step.added is None else f"the model with {step_name(step)}"
@@ -168,5 +168,5 @@ def where_table(diagnosis: Diagnosis) -> Markup:
         "corrected p",
         "residual explained, %",
     ]
-    caption = "free-form curves: on what the torque of which joint depends beyond the final model"
-    return details("On what else it might depend", table(columns, rows, caption))
+    caption = "free-form curves: coordinates on which the residual of the final model depends"
+    return details("Other coordinates that may matter", table(columns, rows, caption))

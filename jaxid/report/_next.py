@@ -9,7 +9,7 @@ from ._html import Content, Markup, figure, number, section, tag
 
 
 def ahead(story: Discovery) -> Markup | None:
-    """A reference to distinguish effects that these recordings cannot; None if there are none."""
+    """A reference to distinguish effects that look alike so far; None if there are none."""
     asked = _open_question(story)
     if asked is None:
         return None
@@ -43,7 +43,7 @@ def _experiment(diagnosis: Diagnosis, effects: list[Verdict], why: str) -> list[
         return [tag("p", f"{why} No reference can be proposed: {error}.", class_="note")]
     if proposed.then < DECISIVE or proposed.then < proposed.now:
         # The recording would not change the verdict.
-        said = f"{why} No reference within the limits reached so far would tell them apart."
+        said = f"{why} No reference within the limits reached so far would distinguish them."
         return [tag("p", said)]
     unit = diagnosis.fit.loop.arm.units()[1]
     drawn = proposed.plot()
@@ -52,9 +52,9 @@ def _experiment(diagnosis: Diagnosis, effects: list[Verdict], why: str) -> list[
     drawn.update_layout(showlegend=False)
     caption = (
         f"Reference of {proposed.recording.duration:.0f} s within the positions, speeds, "
-        "accelerations and torques reached so far. The effects differ on it by "
-        f"{number(proposed.then)} in whitened squared error, on the recordings at hand by "
-        f"{number(proposed.now)}; {DECISIVE:g} is decisive."
+        "accelerations and torques reached so far. The effects differ by "
+        f"{number(proposed.then)} in whitened squared error on it, and by {number(proposed.now)} "
+        f"on the present recordings; {DECISIVE:g} is decisive."
     )
-    said = f"{why} Record this reference and add it to those that are fitted: it tells them apart."
+    said = f"{why} Record this reference and fit it too: it distinguishes the effects."
     return [tag("p", said), figure(drawn, caption)]

@@ -23,7 +23,7 @@ def write_report(story: Discovery, path: str | Path) -> Path:
     """
     path = Path(path)
     if not path.resolve().parent.is_dir():
-        raise ModelError(f"there is no folder {path.parent} to write {path.name} into: make it")
+        raise ModelError(f"there is no folder {path.parent} to write {path.name} into: create it")
     path.write_text(page(story), encoding="utf-8")
     return path
 
@@ -49,7 +49,7 @@ def page(story: Discovery) -> str:
         tag("style", Markup(_part("page.css"))),
     )
     without = tag("noscript", tag("p", "The figures need JavaScript.", class_="note"))
-    # Plain text, so that the browser does not run it; the page's script runs it when it draws.
+    # The browser does not run plain text; the page's script runs it before the first figure.
     library = tag("script", Markup(get_plotlyjs()), type="text/plain", data_library="")
     script = tag("script", Markup(_part("page.js")))
     content = tag("body", tag("main", without, body(story)), library, script)

@@ -24,7 +24,7 @@ def parameters(story: Discovery) -> Markup:
         unit = None if units[name] == "1" else tag("small", f"\u00a0{units[name]}")
         shown: list[Content] = [join(name, unit)]
         if several:
-            shown += [_shown(before.get(name), "added"), _shown(after.get(name), "taken out")]
+            shown += [_shown(before.get(name), "added"), _shown(after.get(name), "removed")]
             shift = shifts.get(name)
             shown.append("" if shift is None else _shift(shift, most))
         else:
@@ -32,12 +32,12 @@ def parameters(story: Discovery) -> Markup:
         rows.append([*shown, _interval(after.get(name))])
     columns = ["parameter", "value", "95 % interval"]
     if several:
-        columns[1:2] = ["before", "after", "shift in deviations"]
+        columns[1:2] = ["before", "after", "shift, std"]
     said = tag(
         "p",
-        "Each value is given with its standard deviation. A shift is counted in the larger of the "
-        "two deviations: a parameter that moved by more than three had taken up part of what the "
-        "starting model lacked.",
+        "Each value is given with its standard deviation (std). A shift is given in units of the "
+        "larger of the two. A shift of more than three means that the parameter had absorbed a "
+        "part of the missing effect.",
     )
     remarks = [tag("p", s, class_="note") for s in (*last.undetermined, *last.notes)]
     deviations = tag("p", f"Deviations: {last.deviations}.") if last.deviations else None

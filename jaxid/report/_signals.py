@@ -20,9 +20,9 @@ MARKED = 0.4
 def signals(beside: Beside) -> Markup:
     """Measured and simulated on one axis with the residual below, one figure per joint."""
     held, k = beside.after, beside.worst
-    seen = "which no fit has seen" if beside.unseen else "which was fitted"
+    seen = "which was held out" if beside.unseen else "which was fitted"
     many = len(held.recordings)
-    which = f" (of {many} such recordings the one with the largest errors)" if many > 1 else ""
+    which = f" (the one with the largest errors, of {many} recordings)" if many > 1 else ""
     when = ", before → after" if beside.several else ""
     name = held.recordings.names[k]
     said = f"Relative error of the {held.signal} on {name}, {seen}{which}{when}:"
@@ -87,8 +87,8 @@ def _figure(beside: Beside, joint: int) -> Markup:
     models = "before and after the effects were added" if beside.several else "by the model"
     caption = (
         f"Joint {joint + 1} along {held.recordings.names[k]}: {held.signal} as measured and as "
-        f"simulated {models}, and below what is left of it. The band holds 95 % of what noise "
-        "alone leaves."
+        f"simulated {models}, with the residual below. The band contains 95 % of the residual "
+        "that noise alone would leave."
     )
     return figure(drawn, caption, linked=True)
 

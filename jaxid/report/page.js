@@ -1,5 +1,5 @@
 "use strict";
-// Tables sort by the column whose name is clicked: down, then up.
+// Tables sort by the column whose name is clicked: descending, then ascending.
 for (const table of document.querySelectorAll("table")) {
   const body = table.tBodies[0];
   const heads = [...table.tHead.rows[0].cells];
@@ -27,8 +27,8 @@ for (const table of document.querySelectorAll("table")) {
   });
 }
 
-// The drawing library lies in the page as text, which costs nothing to load, and is run once, for
-// the first figure that is drawn.
+// The page contains the drawing library as text, which loads fast. It is run once, for the first
+// figure that is drawn.
 function library() {
   if (window.Plotly !== undefined) return;
   const code = document.createElement("script");
@@ -36,17 +36,17 @@ function library() {
   document.head.append(code);
 }
 
-// A figure is drawn once it comes near the window, the others when the browser has nothing to do.
+// A figure is drawn when it comes near the window; the others are drawn when the browser is idle.
 const root = document.documentElement;
 const boxes = [...document.querySelectorAll("[data-figure]")];
 const linked = boxes.filter((box) => box.dataset.linked !== undefined);
-// A finger that moves over a figure scrolls the page; buttons zoom.
+// On a touch screen, a swipe over a figure scrolls the page; buttons zoom.
 const coarse = matchMedia("(pointer: coarse)").matches;
 const config = { responsive: true, displaylogo: false, modeBarButtons: [["toImage", "resetScale2d"]] };
 const colour = (name) => getComputedStyle(root).getPropertyValue(name).trim();
 const ink = () => ({ "font.color": colour("--quiet") });
 const visible = (box) => box.offsetParent !== null;
-// The stretch of time that linked figures show; null for all of it.
+// The time range that linked figures show; null for all of it.
 let shown = null;
 
 function draw(box) {
@@ -63,7 +63,7 @@ function draw(box) {
   box.on("plotly_relayout", follow);
 }
 
-// Figures of one recording show the same stretch of time.
+// Figures of one recording show the same time range.
 function follow(change) {
   const range = change["xaxis.range"] ?? [change["xaxis.range[0]"], change["xaxis.range[1]"]];
   if (change["xaxis.autorange"]) shown = null;
@@ -80,7 +80,7 @@ function show(box) {
   Plotly.relayout(box, shown ? { "xaxis.range": [...shown] } : { "xaxis.autorange": true });
 }
 
-// Plus and minus zoom in time, arrows move, 0 shows all; by the keyboard and by buttons.
+// By keyboard or buttons: plus and minus zoom in time, arrows move, 0 shows all.
 function move(box, name) {
   const [low, high] = box.layout.xaxis.range;
   const middle = (low + high) / 2;
@@ -109,7 +109,7 @@ for (const button of document.querySelectorAll("[data-key]"))
     move(box, button.dataset.key);
   });
 
-// One joint's panel at a time; without this script all of them are there.
+// Shows the panel of one joint at a time; without this script all panels are visible.
 const panels = [...document.querySelectorAll("[data-panel]")];
 const choices = [...document.querySelectorAll("input[name=joint]")];
 function choose() {
@@ -120,7 +120,7 @@ function choose() {
 }
 for (const choice of choices) choice.addEventListener("change", choose);
 
-// What has come to be shown is drawn, at the width and the stretch of time of now.
+// Draws the visible figures, at the present width and time range.
 function refresh() {
   if (!ready) return;
   for (const box of boxes) {
@@ -148,7 +148,7 @@ function drawOne() {
   draw(box);
   idle(drawOne);
 }
-// Not before the page has loaded and been shown: text, tables and links need no figure.
+// Figures wait until the page is loaded and shown; text, tables and links do not need them.
 let ready = false;
 choose();
 addEventListener("load", () =>
@@ -163,7 +163,7 @@ const drawn = () => boxes.filter((box) => box.layout !== undefined);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   for (const box of drawn()) Plotly.relayout(box, ink());
 });
-// Figures are drawn for the window; paper is narrower, white, and shows what is folded away.
+// Figures are drawn for the window. Paper is narrower and white, and shows collapsed content.
 const folded = document.querySelectorAll("details:not(.raw)");
 addEventListener("beforeprint", () => {
   for (const panel of panels) panel.hidden = false;

@@ -8,7 +8,7 @@ from ..errors import FitError
 from ..recording import Recording
 from .smoothing import even_times, resampled
 
-# The part of a motion that does not repeat, relative to the motion, above which it is aperiodic.
+# A motion is aperiodic if more than this share of it does not repeat.
 _APERIODIC = 0.05
 
 
@@ -94,7 +94,7 @@ def period_of(recording: Recording, period: float | None = None) -> float:
         lag = round(period * rate)
         if period <= 0 or lag < 4:
             raise FitError(
-                f"a period of {period:g} s is less than four samples of {recording.name}: give "
+                f"a period of {period:g} s is shorter than four samples of {recording.name}: give "
                 "the period of its reference"
             )
         if n < lag:
@@ -108,8 +108,8 @@ def period_of(recording: Recording, period: float | None = None) -> float:
         if left > _APERIODIC:
             raise FitError(
                 f"{recording.name} does not repeat after {period:g} s: {100 * left:.0f} % of its "
-                "motion differs from one period to the next; cut off where it starts or ends "
-                "(Recording.slice), correct the period, or use IntegralLS, which needs no period"
+                "motion differs between periods; cut off its start and end (Recording.slice), "
+                "correct the period, or use IntegralLS, which needs no period"
             )
         return period
     x = _asked(recording)
@@ -123,7 +123,7 @@ def period_of(recording: Recording, period: float | None = None) -> float:
     )
     differ = differ / x.shape[1]
     low = differ < max(2.0 * float(differ.min()), _APERIODIC**2)
-    # Slow motion differs little over short lags, so search after the first large difference.
+    # Over short lags slow motion differs little; the search begins after a large difference.
     far = int(np.argmax(differ > 0.5)) if np.any(differ > 0.5) else len(lags)
     low[:far] = False
     if not low.any() or float(differ[low].min()) > _APERIODIC**2:
@@ -138,7 +138,7 @@ def period_of(recording: Recording, period: float | None = None) -> float:
     fine = np.linspace(best - 1, best + 1, 201)
     fine = fine[(fine >= 1) & (fine < n - 2)]
     found = float(fine[int(np.argmin([_interpolated(x, lag) for lag in fine]))]) / rate
-    # Prefer a whole number of samples if it fits as well, since most references have one.
+    # Prefer a whole number of samples if it fits equally well: most references have one.
     if abs(found * rate - best) < 0.05:
         found = float(best / rate)
     return period_of(recording, found)
@@ -163,13 +163,13 @@ def settle_harmonics(recording: Recording, period: float, harmonics: int | None)
     if harmonics is not None:
         if harmonics < 1 or harmonics > most:
             raise FitError(
-                f"{harmonics} harmonics cannot be told from {inside} samples a period of "
-                f"{recording.name}: take at most {most} harmonics, or sample faster"
+                f"{harmonics} harmonics cannot be determined from {inside} samples per period of "
+                f"{recording.name}: choose at most {most} harmonics, or sample faster"
             )
         return Harmonics(period, harmonics)
     if most < 1:
         raise FitError(
-            f"{inside} samples a period of {recording.name} are too few for one harmonic: sample "
+            f"{inside} samples per period of {recording.name} are too few for a harmonic: sample "
             "faster"
         )
     time = even_times(recording)
@@ -222,7 +222,7 @@ def repeated(recording: Recording, period: float | None = None) -> Repeated:
     inside = int(np.floor(period / step + 1e-6))
     if count < 2:
         raise FitError(
-            f"{recording.name} holds {count} whole period of {period:g} s: noise needs two"
+            f"{recording.name} has {count} whole period of {period:g} s: noise needs two"
         )
     at = np.add.outer(time[0] + period * np.arange(count), step * np.arange(inside))
     at = np.minimum(at, time[-1]).ravel()

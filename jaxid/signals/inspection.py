@@ -15,11 +15,11 @@ from .smoothing import even_times, resampled, signal_cutoff, smooth_motion
 if TYPE_CHECKING:
     import pandas as pd
 
-# Share of its highest speed below which a joint rests.
+# A joint rests below this share of its highest speed.
 _REST = 0.01
-# Share of it that a joint must reach in both directions to count as reversing.
+# A reversal counts if the joint reaches this share in both directions.
 _TURN = 0.1
-# Correlation above which two references of equal amplitude count as the same.
+# Two references of equal amplitude count as the same above this correlation.
 _SAME = 0.9999
 
 
@@ -27,13 +27,12 @@ class Inspection(eqx.Module):
     """Result of `inspect`.
 
     - `signals`: one row for each recording: samples, rate in Hz, duration in s, jitter of times,
-      largest time between two and number of gaps, whether it has a reference and velocities, the
-      time after which the reference repeats itself, and the frequency up to which the motion is
-      known.
+      largest time between two samples and number of gaps, whether it has a reference and
+      velocities, the period of the reference, and the frequency up to which the motion is known.
     - `joints`: one row for each recording and joint: range of q, top speed, share of time at rest,
-      number of reversals, torque, the step of which all readings of q are multiples (zero without
-      one), and the sampled law if detected: `"every 4"` if torque is held for that many samples,
-      `"each"` if it follows the readings sample by sample, `"-"` if none is detected.
+      number of reversals, torque, the resolution of q (zero if not detected), and the sampled law:
+      `"every 4"` if torque is constant for that many samples, `"each"` if it follows the readings
+      sample by sample, `"-"` if none is detected.
     - `repeats`: pairs of recordings whose references are the same.
     - `notes`: problems to correct, and hints.
     """
@@ -114,14 +113,14 @@ def _period(r: Recording) -> float:
 
 
 def _law(r: Recording, joint: int) -> str:
-    """The sampled law that the torque of a joint shows."""
+    """The sampled law that is detected in the torque of a joint."""
     # At a gap, position and torque jump together.
     edges = [0, *(np.flatnonzero(missing_after(r.time)) + 1).tolist(), r.samples]
     whole = max(itertools.pairwise(edges), key=lambda piece: piece[1] - piece[0])
     tau, q = r.tau[slice(*whole), joint], r.q[slice(*whole), joint]
     if (samples := held(tau)) > 1:
         return f"every {samples}"
-    # The reference adds no information beyond that of the encoder.
+    # The reference adds no information to that of the encoder.
     return "each" if is_followed(follows(q, tau)) else "-"
 
 
@@ -196,17 +195,17 @@ def _notes(recordings: Recordings, joints: "pd.DataFrame") -> list[str]:
         if max(rows["turns"].tolist()) < 2:
             notes.append(
                 f"joint {j} rarely reverses in any recording, so friction and offset cannot be "
-                "separated: record motions to and fro"
+                "separated: record motions in both directions"
             )
         if min(rows["rest %"].tolist()) > 80:
             notes.append(
                 f"joint {j} rests for most of every recording: its inertia and friction will be "
-                "known badly"
+                "uncertain"
             )
     notes += [note for r in recordings for note in _notes_on_times(r)]
     notes += _notes_on_clocks(recordings, joints)
     if len(recordings) == 1:
-        notes.append("one recording alone: record another to be held out of the fit")
+        notes.append("there is only one recording: record another one to be held out of the fit")
     return notes
 
 
@@ -225,14 +224,14 @@ def _notes_on_times(r: Recording) -> list[str]:
         what = "motion" if r.q_ref is None else "reference"
         notes.append(
             f"the {what} of {r.name} repeats every {every:.4g} s, {r.duration / every:.3g} times: "
-            "what differs between periods is noise, or changes with time"
+            "differences between periods are noise, or changes with time"
         )
     if r.q_ref is not None:
         samples = max(held(column) for column in r.q_ref.T)
         if samples > 1:
             notes.append(
                 f"the reference of {r.name} is held for {samples} samples "
-                f"({1e3 * samples * r.period:.4g} ms): it has another clock than the log"
+                f"({1e3 * samples * r.period:.4g} ms): its clock differs from that of the log"
             )
     return notes
 
@@ -252,8 +251,8 @@ def _notes_on_clocks(recordings: Recordings, joints: "pd.DataFrame") -> list[str
     for law, numbers in sorted(_joints_by_law(joints).items()):
         if law == "each":
             notes.append(
-                f"torque of {_listed(numbers)} computed from these very readings, by its coherence "
-                "with them: a law sampled at the log's rate or above, such as control.Sampled"
+                f"torque of {_listed(numbers)} computed from the recorded readings, as coherence "
+                "shows: a law sampled at the log's rate or above, such as control.Sampled"
             )
         else:
             samples = int(law.removeprefix("every "))

@@ -3,20 +3,20 @@
 import numpy as np
 from jaxtyping import Float
 
-# Share of holds that must last as long as the usual one, or a multiple of it, for a clock.
+# A clock is detected if this share of holds lasts as long as the usual one, or a multiple of it.
 _REGULAR = 0.9
-# Coherence above a quarter of the sample rate at which torque counts as computed from the readings.
-# With eight half-overlapping segments, unrelated signals have 0.15.
+# Above this coherence, at frequencies above a quarter of the sample rate, torque was computed from
+# the readings. With eight half-overlapping segments, unrelated signals have 0.15.
 _COHERENT, _PIECES = 0.5, 8
 # Largest decrease of an encoder's spectrum from a quarter to half of the sample rate.
 _FALLS = 10.0
-# Share of a signal's variance by which it may differ from itself a period later, and by which it
-# has to differ in between.
+# Shares of a signal's variance: it may differ by the first after a period, and must differ by the
+# second in between.
 _SAME, _OTHER = 1e-4, 0.1
 
 
 def held(x: Float[np.ndarray, " samples"]) -> int:
-    """Number of samples for which a signal holds each value; 1 if no clock is detected.
+    """Number of samples for which each value of a signal is held; 1 if no clock is detected.
 
     **Arguments:**
 
@@ -35,9 +35,9 @@ def follows(
     """Coherence of torque with readings above a quarter of the sample rate, by its median.
 
     At these frequencies the robot's motion is smaller than the encoder's noise, so a coherent
-    torque was computed from these samples (Welch 1967). None for recordings that are too short, and
-    for readings whose spectrum still falls at these frequencies, since they show the motion rather
-    than the encoder.
+    torque was computed from these samples (Welch 1967). The result is None for recordings that are
+    too short. It is also None for readings whose spectrum still falls at these frequencies, because
+    the motion dominates them.
 
     **Arguments:**
 
@@ -49,7 +49,7 @@ def follows(
     length = min(256, len(readings) // _PIECES)
     if length < 16 or not np.ptp(readings) or not np.ptp(tau):
         return None
-    # The side lobes must be below the encoder's steps, and the motion is 10⁵ times as large.
+    # Side lobes of the motion, which is 10⁵ times larger, must be below the encoder's steps.
     how = {"nperseg": length, "window": "blackmanharris", "detrend": "linear"}
     frequency, power = scipy.signal.welch(readings, **how)
     lower, upper = (power[(frequency > f) & (frequency < f + 0.1)].mean() for f in (0.25, 0.38))

@@ -15,7 +15,7 @@ from ..recording import Recording
 Moving = Callable[[Recording, float], Bool[np.ndarray, "samples joints"] | None]
 
 ORDER = 4
-# Samples in a period of the cutoff; at their Nyquist frequency the filter's gain is a sixth.
+# Samples per period of the cutoff; at their Nyquist frequency the filter's gain is a sixth.
 _SAMPLES = 2.5
 
 
@@ -32,8 +32,8 @@ def low_pass(
     import scipy
 
     sections = scipy.signal.butter(order, cutoff, fs=rate, output="sos")
-    # SciPy's default padding is shorter than the filter's response and distorts a signal that moves
-    # at its end. A straight line passes unchanged, so it is taken off first.
+    # SciPy's default padding is shorter than the filter's response, and distorts a signal that
+    # moves at its end. A straight line passes the filter unchanged, so it is subtracted first.
     pad = min(len(x) - 1, int(np.ceil(4 * rate / cutoff)))
     line = np.linspace(x[0], x[-1], len(x))
     return line + scipy.signal.sosfiltfilt(sections, x - line, axis=0, padlen=pad)
@@ -70,7 +70,7 @@ def resampled(
     x: Float[np.ndarray, "samples columns"],
     at: Float[np.ndarray, " samples"],
 ) -> Float[np.ndarray, "samples columns"]:
-    """Samples at other times, by a cubic spline where the two differ."""
+    """Samples at other times, by a cubic spline if the times differ."""
     import scipy
 
     if np.allclose(time, at, rtol=0, atol=1e-6 * (time[1] - time[0])):
@@ -100,17 +100,17 @@ def signal_cutoff(recording: Recording) -> float:
     if n < 200:
         return rate / 10
     q = scipy.signal.detrend(resampled(recording.time, recording.q, even_times(recording)), axis=0)
-    # The window's side lobes must be below the noise: the motion is 10¹⁰ times as strong.
+    # The window's side lobes must be below the noise; the motion is 10¹⁰ times as strong.
     window = np.asarray(scipy.signal.get_window("blackmanharris", n))[:, None]
     power = np.abs(np.fft.rfft(q * window, axis=0)) ** 2
     f = np.fft.rfftfreq(n, 1 / rate)
     rates = power * f[:, None] ** 2
     speed = rates.sum(axis=0)
-    # A joint that stands still shows only its encoder's steps, and is left out.
+    # A joint at rest has only encoder steps, and is left out.
     moves = rates[f < rate / 10].sum(axis=0) > speed / 2
     chosen = moves if moves.any() else speed > 0
     acceleration = f**4 * (power[:, chosen] / speed[chosen]).sum(axis=1)
-    # About twenty bands of a third of an octave: single lines of a spectrum are too noisy.
+    # About twenty bands of a third of an octave, because single lines of a spectrum are too noisy.
     edges = np.unique(np.round(np.geomspace(4, n // 2, 20)).astype(int))
     bands = list(itertools.pairwise(edges))
     centre = np.array([f[low:high].mean() for low, high in bands])
@@ -123,13 +123,13 @@ def signal_cutoff(recording: Recording) -> float:
 class Band(eqx.Module):
     """The frequencies and samples of signals that are compared.
 
-    Samples are as far apart as the low-pass allows. Closer samples would make the likelihood depend
-    on rounding errors, since there is almost no power above the cutoff.
+    Samples are as far apart as the low-pass allows. There is almost no power above the cutoff, so
+    with closer samples the likelihood would depend on rounding errors.
 
-    - `gain`: the filter's at the frequencies of a real Fourier transform.
+    - `gain`: gain of the filter at the frequencies of a real Fourier transform.
     - `rows`: the samples that are compared, far enough from the ends; `keep` marks those present.
     - `moving`: rows in which a joint moves; in the others it is not compared and its signals are
-      zero. None where all rows count.
+      zero. None if all rows count.
     """
 
     gain: Float[Array, "recordings frequencies"]
@@ -149,11 +149,11 @@ class Band(eqx.Module):
 
         **Arguments:**
 
-        - `cutoffs`: up to which each recording's motion is known, Hz; the lowest is that of all.
-        - `moving`: at which samples of a recording joints move, `(samples, joints)`, below a
-          cutoff, Hz; None for all.
+        - `cutoffs`: frequency up to which each recording's motion is known, Hz; the lowest is used.
+        - `moving`: function of a recording and a cutoff, Hz, that gives the samples at which joints
+          move, `(samples, joints)`; None for all.
 
-        **Raises:** `RecordingError` where a recording is shorter than the filter's settling time.
+        **Raises:** `RecordingError` if a recording is shorter than the filter's settling time.
         """
         import scipy
 
@@ -169,8 +169,8 @@ class Band(eqx.Module):
             rows.append(np.arange(trim, r.samples - trim, step))
             if r.samples - 2 * trim < 10:
                 raise RecordingError(
-                    f"{r.name} lasts {r.duration:.3g} s, and {2 / cutoff:.3g} s at each end are "
-                    f"lost to its low-pass at {cutoff:.3g} Hz: give longer recordings or windows"
+                    f"{r.name} lasts {r.duration:.3g} s, but its low-pass at {cutoff:.3g} Hz needs "
+                    f"{2 / cutoff:.3g} s at each end: give longer recordings or windows"
                 )
         most = shared_length(max(len(row) for row in rows))
         keep = np.arange(most) < np.array([[len(row)] for row in rows])

@@ -20,10 +20,10 @@ from .loop import ClosedLoop
 class Interval(eqx.Module):
     """Inputs of the loop from one grid point to the next; the last interval has zero length.
 
-    `reference` holds the coefficients of the interval's cubic, `torque` those of a line. `held`
-    holds the signals of the recording that are constant in it, by name, `(joints,)` each. `noise`
-    and `rate` are added to the position and velocity that the sensors read, `push` and `pull` to
-    the torque on drives and links; each is given at both ends and is linear in between, or is None.
+    `reference` has the coefficients of the interval's cubic, `torque` those of a line. `held` has
+    the signals that are constant in the interval, by name, `(joints,)` each. `noise` and `rate` are
+    added to the position and velocity that the sensors read, `push` and `pull` to the torque on
+    drives and links. Each of the four is given at both ends and is linear in between, or is None.
     """
 
     t0: Float[Array, ""]
@@ -40,11 +40,11 @@ class Interval(eqx.Module):
 
 
 class Batch(eqx.Module):
-    """Recordings padded to one length, so that one `vmap` covers them.
+    """Recordings padded to one length, for a common `vmap`.
 
     `intervals` has `(recordings, points)` before the axes of each leaf. `at` gives the grid points
-    that are samples, `mask` marks those that are not padding. The initial state is `q0`, `v0`; `q`
-    and `tau` are the measured signals. `band` is the part of them that is compared under this
+    that are samples; `mask` is false for padding. The initial state is `q0`, `v0`; `q` and `tau`
+    are the measured signals. `band` is the part of the signals that is compared under this
     controller, None for all.
     """
 
@@ -95,7 +95,7 @@ def _grid(recording: Recording, period: float | None) -> tuple[np.ndarray, np.nd
         grid = _without_gaps(time, recording.period)
         return grid, np.zeros(len(grid), bool)
     ticks = time[0] + period * np.arange(int((time[-1] - time[0]) / period + 1e-6) + 1)
-    # Times closer than a thousandth of a period are equal, since files round them to decimals.
+    # Times closer than a thousandth of a period are equal, because files round times.
     near = time[np.clip(np.searchsorted(time, ticks - 1e-3 * period), 0, len(time) - 1)]
     ticks = np.where(np.abs(near - ticks) < 1e-3 * period, near, ticks)
     grid = np.union1d(time, ticks)
@@ -105,7 +105,7 @@ def _grid(recording: Recording, period: float | None) -> tuple[np.ndarray, np.nd
 def _without_gaps(
     time: Float[np.ndarray, " samples"], period: float
 ) -> Float[np.ndarray, " points"]:
-    """The samples, with evenly spaced points added where samples are further apart than usual."""
+    """The samples, with evenly spaced points added in gaps."""
     parts = np.maximum(np.round(np.diff(time) / period - 0.25), 1).astype(int)
     if parts.max() == 1:
         return time
@@ -153,7 +153,7 @@ def _drive(
 
 
 def held_names(recordings: Recordings | Sequence[Recording]) -> tuple[str, ...]:
-    """Names of the signals that hold from sample to sample, in all recordings together.
+    """Names of the signals that are constant from sample to sample, over all recordings.
 
     Drives of recordings without `on` count as powered.
 
@@ -165,7 +165,7 @@ def held_names(recordings: Recordings | Sequence[Recording]) -> tuple[str, ...]:
         if absent:
             raise RecordingError(
                 f"{r.name} has no {absent[0]}, which other recordings have: name its column, or "
-                f"give a number for all of it, Recording.from_arrays(..., {absent[0]}=...)"
+                f"give one number for the recording, Recording.from_arrays(..., {absent[0]}=...)"
             )
     return names
 
@@ -173,7 +173,7 @@ def held_names(recordings: Recordings | Sequence[Recording]) -> tuple[str, ...]:
 def held_at(
     recording: Recording, time: Float[np.ndarray, " times"], names: tuple[str, ...]
 ) -> dict[str, Float[np.ndarray, "times joints"]]:
-    """Signals that hold from sample to sample, at any times; drives are powered by default.
+    """Signals that are constant from sample to sample, at any times; drives are powered by default.
 
     **Arguments:**
 
@@ -228,9 +228,11 @@ def check_law(loop: ClosedLoop) -> None:
         raise
     except (TypeError, ValueError) as error:
         reason = str(error).splitlines()[0]
-        raise ModelError(f"{who} has no torque for {n} joints, give all gains: {reason}") from error
+        raise ModelError(
+            f"{who} gives no torque for {n} joints, set all gains: {reason}"
+        ) from error
     if shape != (n,):
-        raise ModelError(f"{who} commands torques of shape {shape}, where there are {n} joints")
+        raise ModelError(f"{who} gives torques of shape {shape}, but there are {n} joints")
 
 
 def _check_noise(noise: Sequence[np.ndarray], recordings: Recordings | Sequence[Recording]) -> None:
@@ -239,7 +241,7 @@ def _check_noise(noise: Sequence[np.ndarray], recordings: Recordings | Sequence[
     for k, recording in enumerate(recordings):
         if np.shape(noise[k]) != recording.q.shape:
             raise RecordingError(
-                f"noise of shape {np.shape(noise[k])} is given for {recording.name}, whose "
+                f"the noise for {recording.name} has shape {np.shape(noise[k])}, but its "
                 f"positions have {recording.q.shape}"
             )
 

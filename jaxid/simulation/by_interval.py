@@ -1,8 +1,8 @@
 """Solvers and step-size controllers that go from interval to interval between samples.
 
-Time is counted in intervals, from 0 at the start of the first to the number of intervals. The
-inputs of the loop may have a kink or a jump between intervals, so no step crosses a boundary. With
-this unit of time they are looked up without a search.
+The unit of time is an interval: time runs from 0 at the start of the first interval to the number
+of intervals. In this unit the loop's inputs are looked up without a search. They may have a kink or
+a jump between intervals, so no step crosses a boundary.
 """
 
 import dataclasses
@@ -47,13 +47,13 @@ def one_of(intervals: Interval, k: Int[Array, ""]) -> Interval:
 
 
 class Window(eqx.Module):
-    """Consecutive intervals from number `first` on; leaves have the axis `(intervals,)` first."""
+    """Consecutive intervals from number `first` on; the first axis of leaves is `(intervals,)`."""
 
     intervals: Interval
     first: int | Int[Array, ""] = 0
 
     def at(self, t: Any) -> "Window":
-        """The interval that contains a time; beyond either end, the last one at that end."""
+        """The interval that contains a time; beyond an end, the interval at that end."""
         count = self.intervals.h.shape[0]
         if count == 1:
             return self
@@ -72,24 +72,24 @@ class WithinIntervals(diffrax.AbstractSolver):
 
     @property
     def term_structure(self):
-        """Of the solver."""
+        """As in the wrapped solver."""
         return self.solver.term_structure
 
     @property
     def interpolation_cls(self):
-        """Of the solver."""
+        """As in the wrapped solver."""
         return self.solver.interpolation_cls
 
     def order(self, terms):
-        """Of the solver."""
+        """As in the wrapped solver."""
         return self.solver.order(terms)
 
     def error_order(self, terms):
-        """Of the solver."""
+        """As in the wrapped solver."""
         return self.solver.error_order(terms)
 
     def init(self, terms, t0, t1, y0, args):
-        """Of the solver."""
+        """As in the wrapped solver."""
         return self.solver.init(terms, t0, t1, y0, args.at(t0))
 
     def func(self, terms, t0, y0, args):
@@ -102,7 +102,7 @@ class WithinIntervals(diffrax.AbstractSolver):
 
 
 class ThroughIntervals(diffrax.AbstractSolver):
-    """RK4 whose step is a whole interval, so that the loop's inputs are looked up once for it.
+    """RK4 whose step is a whole interval; the loop's inputs are looked up once per interval.
 
     Within an interval the state is split into rows, and time is in seconds.
     """
@@ -118,7 +118,7 @@ class ThroughIntervals(diffrax.AbstractSolver):
         return self.method.order(terms)
 
     def init(self, terms, t0, t1, y0, args) -> None:
-        """It keeps nothing between steps."""
+        """No solver state is kept between steps."""
         return None
 
     def func(self, terms, t0, y0, args):
@@ -126,7 +126,7 @@ class ThroughIntervals(diffrax.AbstractSolver):
         return terms.vf(t0, y0, args)
 
     def step(self, terms, t0: Any, t1: Any, y0, args, solver_state, made_jump):
-        """Through one interval."""
+        """One step through one interval."""
         interval = one_of(args.at(t0).intervals, jnp.asarray(0))
         dt = interval.h / self.substeps
         inside = diffrax.ODETerm(lambda t, y, args: self.rate(interval, jnp.asarray(t), y))
@@ -173,7 +173,7 @@ class EqualSteps(diffrax.AbstractStepSizeController):
 
     **Arguments:**
 
-    - `count`: how many for each.
+    - `count`: number of steps per interval.
     """
 
     count: int | Int[Array, ""]
@@ -191,19 +191,19 @@ class EqualSteps(diffrax.AbstractStepSizeController):
         self, t0: Any, t1: Any, y0, y1_candidate, args, y_error, error_order, state
     ):
         """The next step."""
-        # Reported as a jump, so that no solver reuses a slope from another interval.
+        # Reported as a jump; otherwise a solver could reuse a slope from another interval.
         end = (state + 1) / self.count
         return True, t1, end, True, state + 1, diffrax.RESULTS.successful
 
 
 class CutSteps(diffrax.AbstractAdaptiveStepSizeController):
-    """Another controller's steps, shortened to end where an interval ends.
+    """The steps of another controller, shortened so that none crosses the end of an interval.
 
     **Arguments:**
 
     - `control`: the other controller, in seconds.
     - `start`, `length`: of the intervals, s; `length` is positive.
-    - `first`: length of the first step that is tried, s.
+    - `first`: length of the first trial step, s.
     """
 
     control: diffrax.AbstractAdaptiveStepSizeController
@@ -218,23 +218,23 @@ class CutSteps(diffrax.AbstractAdaptiveStepSizeController):
 
     @property
     def atol(self):
-        """Of the other."""
+        """Absolute tolerance of the other controller."""
         return self.control.atol
 
     @property
     def norm(self):
-        """Of the other."""
+        """Norm of the other controller."""
         return self.control.norm
 
     def wrap(self, direction):
-        """This controller around the wrapped other one; time runs forward only."""
+        """The same controller with the other one wrapped; time runs forward only."""
         return dataclasses.replace(self, control=self.control.wrap(direction))
 
     def _seconds(self, t: Time, interval: Int[Array, ""]) -> Time:
         return self.start[interval] + (t - interval) * self.length[interval]
 
     def _within(self, t: Any, step: Any, interval: Int[Array, ""]) -> Time:
-        """The end of a step of some seconds that begins at `t`."""
+        """The end of a step of given length, s, that begins at `t`."""
         after = jnp.maximum(t + step / self.length[interval], jnp.nextafter(t, jnp.inf))
         return jnp.minimum(after, (interval + 1).astype(t.dtype))
 
@@ -247,7 +247,7 @@ class CutSteps(diffrax.AbstractAdaptiveStepSizeController):
     def adapt_step_size(
         self, t0: Any, t1: Any, y0, y1_candidate, args, y_error, error_order, state
     ):
-        """Whether to keep the step, and the next one."""
+        """Whether to accept the step, and the next step."""
         last = self.start.shape[0] - 1
         now = jnp.clip(jnp.floor(t0).astype(int), 0, last)
         keep, begin, end, jump, state, result = self.control.adapt_step_size(

@@ -8,7 +8,7 @@ of 4 steps, this module / LAPACK (without a solve: 0.5 and 1.7):
 | simulation | 1.2 / 20 | 2.6 / 20 | 4.7 / 27 | 8.4 / 20 | 13 / 45  |
 | Jacobian   | 4.2 / 54 | 6.4 / 41 | 12 / 49  | 17 / 49  | 27 / 57  |
 
-Compilation takes 2 to 4 s longer, with 10 unknowns 8 s. Written out scalar by scalar, with a
+Compilation takes 2 to 4 s longer; with 10 unknowns, 8 s longer. In code unrolled to scalars, with a
 selection for each element of each row that may be the pivot, six unknowns take 12 and 22 ms.
 """
 

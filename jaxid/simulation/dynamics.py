@@ -37,7 +37,7 @@ def settle(
     reference: Reference,
     label: Int[Array, ""],
 ) -> State:
-    """The state with the effects' own states settled at the first command, so none ramps up."""
+    """The state with the effects' own states in equilibrium at the first command."""
     seen = read(loop, state.q, state.v)
     mass = loop.arm.mass_matrix(state.q)
     tau = loop.controller.command(seen, reference, state.controller, mass)
@@ -88,7 +88,7 @@ def behind(
 
 
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Solves a small positive-definite system, unrolled: LAPACK's call costs more than the sums."""
+    """Solves a small positive-definite system, unrolled: a call of LAPACK would be slower."""
     n = right.shape[0]
     rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
     b = [right[i] for i in range(n)]
@@ -142,17 +142,17 @@ def effect_loads(
     curves: bool = True,
     inertia: bool = True,
 ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
-    """Torque that all effects require of the drives, and that of the links, `(joints,)` each.
+    """Torque that effects on the drives and on the links require, `(joints,)` each.
 
-    Load-dependent effects come last, since they depend on the torque less all others. Acceleration
-    is solved for, so terms proportional to it are not subtracted.
+    Load-dependent effects come last, because they depend on the torque minus all other effects.
+    Acceleration is solved for, so terms proportional to it are not subtracted.
 
     **Arguments:**
 
-    - `motion`: of the drives. `states`: the effects' own. `links`: the links' motion, if it differs
-      from the drives'.
+    - `motion`: motion of the drives. `states`: the effects' own states. `links`: motion of the
+      links, if it differs from that of the drives.
     - `push`: external torque on the drives, which load-dependent effects include.
-    - `curves`: False to leave out effects that need an acceleration that is not known yet.
+    - `curves`: False to leave out effects that need an acceleration which is not known yet.
     - `inertia`: False to leave out terms proportional to acceleration.
     """
     drive = link = ahead = jnp.zeros_like(motion.v)
@@ -192,7 +192,7 @@ def link_load(
 
     **Arguments:**
 
-    - `links`: their motion. `states`: the effects' own.
+    - `links`: motion of the links. `states`: the effects' own states.
     """
     load, still = loop.arm.bias(links.q, links.v), jnp.zeros_like(links.q)
     for effect, state in zip(loop.effects, states, strict=True):
@@ -238,10 +238,10 @@ def instant(
     **Arguments:**
 
     - `t`: time, s.
-    - `state`: of the loop.
-    - `reference`: of the controller.
+    - `state`: state of the loop.
+    - `reference`: reference of the controller.
     - `outside`: external inputs.
-    - `label`: which recording.
+    - `label`: index of the recording.
     """
     if imposed(loop):
         return _along_reference(loop, t, state, reference, outside, label)
@@ -276,10 +276,10 @@ def instant(
 
 
 def imposed(loop: ClosedLoop) -> bool:
-    """Whether the motion is the reference itself, so that it need not be simulated.
+    """Whether the motion is the reference itself and need not be simulated.
 
-    This is so if the law imposes the motion, unless an effect gives the arm a motion of its own or
-    a drive does more than multiply its command, so that the command does not follow from torque.
+    The law must impose the motion. No effect may give the arm a motion of its own, and each drive
+    may only multiply its command; otherwise the command does not follow from torque.
     """
     return loop.controller.imposes and not any(
         isinstance(effect, AbstractTransmission)
@@ -301,7 +301,7 @@ def _along_reference(
     outside: Outside,
     label: Int[Array, ""],
 ) -> Instant:
-    """Inverse dynamics at one instant of the motion at which the sensors read the reference."""
+    """Inverse dynamics at one instant, for the motion at which the sensors read the reference."""
     noise, seen = outside.noise, Reading(reference.q, reference.v)
     at = seen.q - noise.q, seen.v - noise.v
     rates = seen.v - noise.v, reference.a - outside.noise_rate
@@ -322,7 +322,7 @@ def _along_reference(
 def _commanded(
     loop: ClosedLoop, motion: Motion, tau: Float[Array, " joints"]
 ) -> Float[Array, " joints"]:
-    """The command at which drives that multiply it deliver a torque, `(joints,)`."""
+    """The command at which the drives deliver a torque, `(joints,)`; they only multiply it."""
     drives = [effect for effect in loop.effects if _drives(effect)]
     if not drives:
         return tau
@@ -343,7 +343,7 @@ def _beside_bodies(
     rigid: Float[Array, " joints"],
     outside: Outside,
 ) -> Float[Array, " joints"]:
-    """Torque that a motion needs in addition to `rigid`, less external torque."""
+    """Torque that a motion needs in addition to `rigid`, minus external torque."""
     helped = outside.push + outside.pull
     if any(effect.loaded for effect in loop.effects):
         # Load-dependent effects get the torque that the motion needs without them.
@@ -387,7 +387,7 @@ def _through_transmissions(
     outside: Outside,
     added: Float[Array, "joints joints"],
 ) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
-    """Rotors on the drive's side, the rest of the inertia on the link's (Spong 1987)."""
+    """Rotors on the drive's side, the other inertia on the link's side (Spong 1987)."""
     q, v = state.q, state.v
     rotors = passed = jnp.zeros_like(q)
     apart = jnp.zeros_like(q, bool)

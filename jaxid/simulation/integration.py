@@ -1,7 +1,7 @@
 """Integration of a loop through the intervals of a recording, by diffrax.
 
-Time is counted in intervals here (see `by_interval`), so that the loop's inputs are looked up
-without a search, and intervals of zero length, which pad recordings, leave the state unchanged.
+The unit of time is an interval (see `by_interval`), so the loop's inputs are looked up without a
+search. Padding consists of intervals of zero length, which leave the state unchanged.
 """
 
 import dataclasses
@@ -96,7 +96,7 @@ def initial(
 def observe(
     loop: ClosedLoop, interval: Interval, x: Float[Array, " states"], rows: tuple[int, ...]
 ) -> tuple[Float[Array, " states"], Float[Array, "rows joints"]]:
-    """The start of an interval: the state once a sampled law has ticked, and rows of `SIGNALS`."""
+    """The start of an interval: the state after a sampled law's tick, and rows of `SIGNALS`."""
     unravel = unflatten(loop)
 
     def begin(interval: Interval, x: Float[Array, " states"]):
@@ -111,7 +111,7 @@ def observe(
         seen = (now.command, now.reading.q, now.reading.v, now.a, now.tau)
         return ravel_pytree(state)[0], jnp.stack([seen[row] for row in rows])
 
-    # Along a given motion the instants are independent, and are computed as arrays of many.
+    # Along a given motion the instants are independent, so many are computed as one array.
     return begin(interval, x) if imposed(loop) else unrolled(begin, interval, x)(interval, x)
 
 
@@ -163,7 +163,7 @@ def _solve(
     substeps: int | Int[Array, ""] | None = None,
     stop: float | Float[Array, ""] | None = None,
 ) -> diffrax.Solution:
-    """From the start of the first interval to the end of the last; `stop` for an earlier end."""
+    """Solves from the start of the first interval to the end of the last, or to `stop`."""
     stepping, count = loop.stepping, intervals.h.shape[0]
     substeps = _substeps(loop, substeps)
 
@@ -215,8 +215,8 @@ def integrate(
 
     **Arguments:**
 
-    - `intervals`: between grid points; the last, which has zero length, ends the run.
-    - `substeps`: replaces the number in the settings, for programs that serve any number.
+    - `intervals`: between grid points; the last one has zero length and ends the run.
+    - `substeps`: replaces the number in the settings; a traced value serves any number.
     """
     if given(loop):
         return states_of_reference(loop, intervals, x0), success()
@@ -231,7 +231,7 @@ def integrate(
 
 
 def given(loop: ClosedLoop) -> bool:
-    """Whether the recordings give all states, so that there is nothing to integrate."""
+    """Whether the recordings give all states, which leaves nothing to integrate."""
     return imposed(loop) and not any(effect.initial_state().size for effect in loop.effects)
 
 
@@ -257,12 +257,12 @@ def integrate_with_tangents(
     """`integrate` with the derivative of every state, for RK4 with fixed steps.
 
     RK4 integrates the sensitivity equations together with the state. For fixed steps this is the
-    exact derivative of the discrete run, equal to forward mode through the solve. It takes half as
-    long to trace, since forward mode and `vmap` would each trace all of diffrax again.
+    exact derivative of the discrete run, equal to forward mode through the solve. Tracing takes
+    half as long: forward mode and `vmap` would each trace all of diffrax again.
     """
     through = jax.tree.map(lambda leaf: leaf[:-1], intervals)
 
-    # A separately jitted function, since diffrax traces a step several times.
+    # Jitted separately, because diffrax traces a step several times.
     @jax.jit
     def rate(interval, t, rows):
         def plain(loop, x):
@@ -274,7 +274,7 @@ def integrate_with_tangents(
 
 
 def _at_steps(loop, rate, through, y0, substeps=None):
-    """States at grid points if a step is an interval: no interpolation, and no step can fail."""
+    """States at grid points if every step is an interval: no interpolation, no failing steps."""
     ys = _solve(loop, rate, through, y0, diffrax.SaveAt(steps=True), substeps).ys
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), y0, ys)
 
@@ -297,7 +297,7 @@ def through_interval(
     alone = jax.tree.map(lambda leaf: leaf[None], interval)
     rate = _rate(loop, alone, x)
     if loop.stepping.plain:
-        # One step cannot fail, and a solve around it would only take longer to compile.
+        # One step cannot fail; a solve around it would only lengthen the compilation.
         count = _substeps(loop, substeps)
         solver = ThroughIntervals(loop.stepping.solver, rate, count)
         start = jnp.zeros(())
@@ -324,7 +324,7 @@ def success() -> Int[Array, ""]:
 
 
 def unless_finite(code: Int[Array, ""], values: Float[Array, "..."]) -> Int[Array, ""]:
-    """The result number; that for values that are not finite if nothing else is wrong."""
+    """The result number; if it is success and values are not finite, the number for that."""
     bad = ~jnp.all(jnp.isfinite(values))
     return jnp.where((code == 0) & bad, _number(diffrax.RESULTS.nonfinite), code)
 
@@ -335,6 +335,6 @@ def _number(result: Any) -> Int[Array, ""]:
 
 
 def reason(code: int | np.integer | Int[Array | np.ndarray, ""]) -> str:
-    """Why a solve failed, in diffrax's words; empty if it did not."""
+    """The reason why a solve failed, in diffrax's words; empty after success."""
     kind = jax.tree.structure(diffrax.RESULTS.successful)
     return diffrax.RESULTS[jax.tree.unflatten(kind, [np.asarray(code)])]

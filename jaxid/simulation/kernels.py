@@ -26,18 +26,19 @@ _SPLITTING = frozenset(
     triangular_solve tridiagonal tridiagonal_solve
     """.split()  # noqa: SIM905
 )
-# Up to these sizes matrix products are written as sums of columns. Times in ms on a SCARA with a
-# network of two hidden layers in its torque, 501 samples of 4 steps, sums against products (without
-# a network: 0.5 and 1.7): simulation 1.5 against 1.7 with layers of 16 and 2.6 against 2.5 with
-# layers of 32, Jacobian 9 against 41 and 30 against 60. Written out scalar by scalar, the larger
-# network took 9 and 185 ms. One reduction over all columns takes 6 ms for the smaller network's
-# Jacobian, but 340 with 49 parameters, where XLA moves it out of the kernel; sums of columns then
-# take 100.
+# Up to these sizes matrix products are written as sums of columns. Times on a SCARA with a network
+# of two hidden layers in its torque, 501 samples of 4 steps, in ms with sums / with products
+# (without a network the simulation takes 0.5, the Jacobian 1.7):
+#   layers of 16: simulation 1.5 / 1.7, Jacobian 9 / 41
+#   layers of 32: simulation 2.6 / 2.5, Jacobian 30 / 60
+# In code unrolled to scalars the larger network took 9 (simulation) and 185 (Jacobian). One
+# reduction over all columns takes 6 for the smaller network's Jacobian. With 49 parameters it takes
+# 340, because XLA moves it out of the kernel; sums of columns then take 100.
 _MOST_PRODUCTS, _DEEPEST = 1024, 64
 
 
 def plain_product(params, dtype) -> bool:
-    """Whether a product names no algorithm and accumulates in a type that holds its operands."""
+    """Whether a product names no algorithm and its accumulation type holds its operands."""
     wanted = params["preferred_element_type"] or dtype
     precision = params["precision"]
     usual = precision is None or isinstance(precision, (tuple, jax.lax.Precision))
@@ -45,7 +46,7 @@ def plain_product(params, dtype) -> bool:
 
 
 def summed_product(eqn, operands: list[Any]) -> tuple[Array] | None:
-    """A small product with a matrix as a sum of products of columns; None for any other.
+    """A small product with a matrix, as a sum of products of columns; None for other products.
 
     XLA already compiles products of two vectors as sums.
     """
@@ -81,7 +82,7 @@ def _summed(eqn) -> bool:
     )
 
 
-# Functions already warned about, since a fit compiles half a dozen programs of one loop.
+# Functions that a warning has named; a fit compiles half a dozen programs of one loop.
 _SAID: set[str] = set()
 
 
@@ -91,7 +92,7 @@ def say_what_splits(eqn, origin) -> None:
     **Arguments:**
 
     - `eqn`: an equation that is evaluated with whole arrays.
-    - `origin`: the equation that it is a part of, which has the source location.
+    - `origin`: the outer equation, which has the source location.
     """
     found = _splitting(eqn)
     if found is None or jax.default_backend() != "cpu":
@@ -101,9 +102,9 @@ def say_what_splits(eqn, origin) -> None:
         return
     _SAID.add(who)
     warnings.warn(
-        f"{who} calls {found}, which XLA does not compile into the kernel of a simulation's loop, "
-        "so simulations and fits may take 20 times as long: keep it to sums, products of at most "
-        "1024 terms and solves for at most 8 unknowns, or accept the wait",
+        f"{who} calls {found}, which XLA does not compile into the kernel of a simulation's loop; "
+        "simulations and fits may take 20 times as long: use only sums, products of at most 1024 "
+        "terms and solves for at most 8 unknowns, or accept the longer time",
         JaxidWarning,
         stacklevel=2,
     )

@@ -45,7 +45,7 @@ class ClosedLoop(eqx.Module):
     controller: AbstractController
     effects: tuple[AbstractEffect, ...] = eqx.field(default=(), converter=tuple)
     name: str = eqx.field(static=True, default="robot")
-    # By place, since a name may pass to another parameter when effects are added or removed.
+    # By place, because another parameter may get the name when effects are added or removed.
     held: frozenset[Place] = eqx.field(static=True, default=frozenset(), converter=frozenset)
     freed: frozenset[Place] = eqx.field(static=True, default=frozenset(), converter=frozenset)
     resolution: tuple[float, ...] | None = eqx.field(static=True, default=None)
@@ -62,14 +62,13 @@ class ClosedLoop(eqx.Module):
             if joint is not None and not 1 <= joint <= self.joints:
                 raise ModelError(
                     f"{effect.effect_name()} is on joint {joint}, but {self.name} has joints 1 to "
-                    f"{self.joints}: joints count from 1"
+                    f"{self.joints}: joints are counted from 1"
                 )
         joints = [e.joint for e in self.effects if isinstance(e, AbstractTransmission)]
         for joint in joints:
             if joints.count(joint) > 1:
                 raise ModelError(
-                    f"{self.name} has two transmissions on joint {joint}: keep the one that gives "
-                    "way between its drive and its link"
+                    f"{self.name} has two transmissions on joint {joint}: keep one of them"
                 )
 
     @property
@@ -107,7 +106,7 @@ class ClosedLoop(eqx.Module):
         return tuple(name for p in self.free_parameters for name in p.names)
 
     def unit(self, parameter: Parameter) -> str:
-        """A parameter's unit; in m and N if its joint slides."""
+        """A parameter's unit; with m and N for a prismatic joint."""
         unit, joint = parameter.declaration.unit, parameter.joint
         slides = joint is not None and self.arm.prismatic()[joint - 1]
         return sliding_unit(unit) if slides else unit
@@ -215,7 +214,7 @@ class ClosedLoop(eqx.Module):
             there = sorted({effect.effect_name() for effect in self.effects})
             where = "" if joint is None else f" on joint {joint}"
             raise ModelError(
-                f"there is no effect {name!r}{where} to take away: the loop has {', '.join(there)}"
+                f"there is no effect {name!r}{where} to remove: the loop has {', '.join(there)}"
             )
         return self.with_effects(kept)
 

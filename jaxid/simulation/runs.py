@@ -94,7 +94,7 @@ def run(
 
     **Arguments:**
 
-    - `substeps`: for programs that serve any number of substeps; None for the loop's own.
+    - `substeps`: a traced number, for programs that serve any number; None for the loop's own.
     - `rows`: which of `SIGNALS`.
 
     **Returns:** states, signals, and the result number: zero is success, see `reason`. After a
@@ -115,7 +115,7 @@ def at_points(loop: ClosedLoop, fun: Callable, *args):
 
 
 def _ticking(loop, intervals, x0, substeps, rows):
-    """A run under a sampled law, interval by interval, since the law acts between intervals."""
+    """A run under a sampled law, interval by interval, because the law acts between intervals."""
 
     def body(carry, interval):
         x, code = carry
@@ -249,7 +249,7 @@ def simulate_batch(loop: ClosedLoop, batch: Batch) -> Simulated:
     substeps = None
     forward = isinstance(loop.stepping.adjoint, diffrax.ForwardMode)
     if loop.stepping.control is None and forward:
-        # One program for any number of steps, so that refining them needs no compilation.
+        # One program serves any number of steps; refining them needs no compilation.
         substeps = np.asarray(loop.stepping.substeps or 1)
         loop = set_substeps(loop, None, settled=False)
     # What is compared does not enter, and would only make programs differ.

@@ -27,13 +27,13 @@ def cores() -> int:
 
 
 def of_this_machine(mesh: Mesh) -> bool:
-    """Whether a mesh has only host devices of this process, which are no more than threads."""
+    """Whether a mesh has only host devices of this process, which are mere threads."""
     here = jax.process_index()
     return all(d.platform == "cpu" and d.process_index == here for d in mesh.devices.flat)
 
 
 def shares_of(count: int, parts: int) -> list[Int[np.ndarray, " rows"]]:
-    """Recordings of each of `parts`: equally many, padded by repeating the last."""
+    """Recordings of each of `parts`, equally many; the last recording is repeated as padding."""
     size = -(-count // min(parts, count))
     return [np.minimum(np.arange(k, k + size), count - 1) for k in range(0, count, size)]
 
@@ -76,7 +76,7 @@ def one_by_one(fun: Callable[[Any], Any], each: PyTree) -> Any:
 class EndToEnd:
     """Preallocated arrays for the leaves of all parts, concatenated along their leading axes.
 
-    Each part is copied in when it is ready, so that large arrays are not held or copied twice.
+    Each part is copied when it is ready, so large arrays are not stored or copied twice.
     """
 
     def __init__(self, parts: int):
@@ -127,8 +127,9 @@ def everywhere(tree: PyTree, mesh: Mesh) -> PyTree:
 def shared_out(fun: Callable[..., Result], mesh: Mesh, same: PyTree, each: PyTree) -> Result:
     """`fun(same, each)` with the leading axis of `each` split over a mesh; called inside a jit.
 
-    If `count` does not divide evenly, copies of the last entry fill it up, and their results are
-    dropped. The result is on every device, so later computations do not depend on the mesh.
+    If `count` is not a multiple of the number of devices, copies of the last entry are added and
+    their results are dropped. The result is on every device, so later computations do not depend on
+    the mesh.
 
     **Arguments:**
 

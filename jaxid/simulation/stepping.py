@@ -16,7 +16,7 @@ from ..errors import ModelError
 class RK4(diffrax.AbstractSolver):
     """The classical Runge–Kutta method of order four, for fixed steps (Kutta 1901).
 
-    diffrax's own methods compute error estimates and dense output. Unused, these still cost more
+    diffrax's own methods compute error estimates and dense output. Even if unused, these cost more
     than the physics of four states.
 
     **Arguments:**
@@ -103,22 +103,22 @@ class Stepping(eqx.Module):
         name = type(self.solver).__name__
         if not _whole(self.solver):
             raise ModelError(
-                f"{name} wants the equations in parts, which a loop does not have: choose another "
-                "solver, for instance diffrax.Tsit5() or diffrax.Kvaerno5()"
+                f"{name} needs equations in several terms, but a loop has one term: choose another "
+                "solver, for example diffrax.Tsit5() or diffrax.Kvaerno5()"
             )
         if self.substeps is not None and self.substeps < 1:
-            raise ModelError(f"substeps is {self.substeps}, but a sample takes one step at least")
+            raise ModelError(f"substeps is {self.substeps}, but it must be at least 1")
         if self.control is None:
             return
         if not isinstance(self.control, diffrax.AbstractAdaptiveStepSizeController):
             raise ModelError(
-                f"{type(self.control).__name__} does not adapt its steps: give no control, and "
-                "Stepping(substeps=...) for the number of steps between two samples"
+                f"{type(self.control).__name__} does not adapt its steps: leave out control, and "
+                "set the number of steps between two samples by Stepping(substeps=...)"
             )
         if not isinstance(self.solver, diffrax.AbstractAdaptiveSolver):
             raise ModelError(
-                f"{name} estimates no error, which {type(self.control).__name__} needs: choose "
-                "another solver, or give no control for fixed steps"
+                f"{name} gives no error estimate, which {type(self.control).__name__} needs: "
+                "choose another solver, or leave out control for fixed steps"
             )
 
     @property
@@ -136,9 +136,9 @@ def _whole(solver: diffrax.AbstractSolver) -> bool:
 def ready(stepping: Stepping) -> diffrax.AbstractSolver:
     """The solver with the settings that diffrax would give to an unwrapped solver in a solve.
 
-    An implicit one whose root finder has no tolerances takes them from the step-size controller.
-    Fixed steps have no controller, and diffrax's own root finder is designed for one: with tight
-    tolerances it mistakes rounding for divergence. Newton's method therefore replaces it.
+    An implicit solver whose root finder has no tolerances takes them from the step-size controller.
+    Fixed steps have no controller. diffrax's own root finder is designed for one: with tight
+    tolerances it mistakes rounding for divergence. It is then replaced by Newton's method.
     """
     solver: Any = stepping.solver
     if isinstance(solver, diffrax.AbstractImplicitSolver):
@@ -151,7 +151,7 @@ def ready(stepping: Stepping) -> diffrax.AbstractSolver:
             at = lambda s: [getattr(s.root_finder, name) for name in names]  # noqa: E731
             solver = eqx.tree_at(at, solver, given)
     if isinstance(solver, diffrax.AbstractRungeKutta) and solver.scan_kind is None:
-        # The kind of loop over its stages determines which derivatives are possible.
+        # The kind of loop over the stages determines which derivatives are possible.
         kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
         kind = kinds.get(type(stepping.adjoint))
         solver = eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)

@@ -22,20 +22,20 @@ from .integration import given
 from .loop import ClosedLoop
 from .stepping import RK4
 
-# Steps between two samples above which a simulation is reported as slow, and refused.
+# Steps between two samples above which a simulation is reported as slow, and is refused.
 MANY, TOO_MANY = 64, 10_000
 
 
 def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     """The loop with the number of steps between samples chosen, if the user did not set it.
 
-    A step is at most 2.5 ms, and at most a quarter of the fastest time constant, which occurs at
-    standstill, where friction is steepest. It is also short enough for a bristle to be stable at
-    speed. Time constants do not limit implicit solvers. A number chosen before is raised if an
-    effect with its own states was added that needs more. A step-size controller needs no number.
+    A step is at most 2.5 ms, and at most a quarter of the fastest time constant at standstill,
+    where friction is steepest. It is short enough for a bristle to be stable at speed. Time
+    constants do not limit implicit solvers. If an added effect with its own states needs more
+    steps, a number chosen before is raised. A step-size controller needs no number.
 
-    **Raises:** `ModelError` if more than 10 000 steps would be needed. More than 64 are used with
-    a `JaxidWarning`.
+    **Raises:** `ModelError` if more than 10 000 steps are needed; warns with `JaxidWarning` if more
+    than 64 are needed.
     """
     check_joints(loop, recordings[0])
     before, settled = loop.stepping.substeps, loop.stepping.settled
@@ -51,7 +51,7 @@ def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     else:
         still, moving = _rates(loop, recordings)
     if before is None:
-        # The relative error of the torque of a stiff assumed law is about (pace · step)⁴ / 20.
+        # For a stiff assumed law the relative error of the torque is about (pace · step)⁴ / 20.
         pace = 7 * loop.controller.pace
         rate = max(1 / 2.5e-3, still / 0.25, moving / 2, pace)
     else:
@@ -70,16 +70,16 @@ def steps_at(rate: float, interval: float, name: str) -> int:
     """
     steps = max(math.ceil(interval * rate - 1e-9), 1)
     said = (
-        f"{name} changes so fast, within {1 / rate:.2g} s, that it takes {steps} steps between two "
-        f"samples {interval:.3g} s apart"
+        f"{name} needs steps of at most {1 / rate:.2g} s, which are {steps} between two samples "
+        f"{interval:.3g} s apart"
     )
     if steps > TOO_MANY:
         raise ModelError(
-            f"{said}, more than {TOO_MANY}: look for a parameter that makes it so stiff, or choose "
+            f"{said}, more than {TOO_MANY}: look for a parameter that makes it stiff, or choose "
             "an implicit solver, jaxid.Stepping(solver=diffrax.Kvaerno5(), control=...)"
         )
     if steps > MANY:
-        remedy = "a parameter may make it stiffer than it is, and an implicit solver needs fewer"
+        remedy = "a parameter may make it too stiff, and an implicit solver needs fewer"
         _say(f"{said}: {remedy} (jaxid.Stepping(solver=diffrax.Kvaerno5(), control=...))")
     return steps
 
@@ -89,12 +89,12 @@ def refined(steps: float, name: str) -> int:
 
     **Arguments:**
 
-    - `steps`: wanted between two samples; limited to 10 000.
+    - `steps`: required between two samples; limited to 10 000.
     - `name`: of the loop.
     """
     taken = math.ceil(min(steps, TOO_MANY))
     if taken > MANY:
-        error = "" if steps <= TOO_MANY else f", where its error asks for {steps:.3g}"
+        error = "" if steps <= TOO_MANY else f", but its error would require {steps:.3g}"
         _say(
             f"{name} is integrated with {taken} steps between two samples{error}: a solver of "
             "higher order or with a controller needs fewer (jaxid.Stepping)"
@@ -125,7 +125,7 @@ def with_rolled_stages(loop: ClosedLoop) -> ClosedLoop:
     """The loop with the stages of its steps in a loop: for derivatives, and for many settings.
 
     Unrolled stages are fastest for a single simulation. With all tangents, four unrolled stages
-    exceed the registers and first cache of a core: half as fast, and slower to compile.
+    exceed the registers and first cache of a core; they are half as fast and slower to compile.
     """
     solver = loop.stepping.solver
     if not isinstance(solver, RK4):
@@ -148,7 +148,7 @@ def with_reverse_mode(loop: ClosedLoop, points: int) -> ClosedLoop:
 
     **Arguments:**
 
-    - `points`: of the grid; this many states are kept, so that none is computed twice.
+    - `points`: number of grid points; as many states are stored, so none is computed twice.
     """
     if loop.stepping.plain:
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=points)
@@ -206,6 +206,6 @@ def _slopes(
 
 
 def _largest(slopes: Float[np.ndarray, "points n n"]) -> float:
-    """Largest magnitude of an eigenvalue; zero where no slope is finite."""
+    """Largest magnitude of an eigenvalue; zero if no slope is finite."""
     usable = slopes[np.isfinite(slopes).all(axis=(1, 2))]
     return float(np.abs(np.linalg.eigvals(usable)).max()) if len(usable) else 0.0

@@ -29,7 +29,7 @@ from .loop import ClosedLoop
 
 SAID = (Viscous, Coulomb, RotorInertia, DCMotor, DriveGain, TimeDelay, TorqueSaturation)
 LAWS = (PD, PID, Servo, Impedance)
-# An error large enough for every drive that has a limit to reach it, rad or m.
+# A position error at which every drive with a limit reaches it, rad or m.
 _FAR = 1e6
 
 
@@ -89,21 +89,21 @@ def joint_terms(
 def unsaid(loop: ClosedLoop) -> dict[int, str]:
     """Parts of a loop that these parameters do not express, by the effect's index, -1 for others.
 
-    Each has its reason, as part of a sentence. The others are not effects that could be left out:
-    parts of the law, and a motor's limit of current.
+    Each part has its reason, as part of a sentence. Index -1 is for parts of the law and a motor's
+    current limit, which cannot be left out like an effect.
     """
     found: dict[int, str] = {}
     rest: list[str] = []
     law = loop.controller.law if isinstance(loop.controller, Sampled) else loop.controller
     if not isinstance(law, LAWS):
-        rest.append(f"the law {type(law).__name__} is no kp and kd")
+        rest.append(f"the law {type(law).__name__} cannot be expressed by kp and kd")
     elif isinstance(law, PID) and np.any(np.asarray(law.Ki) != 0):
-        rest.append("an integral is no kp and kd")
+        rest.append("an integral cannot be expressed by kp and kd")
     elif isinstance(law, Servo) and np.any(np.asarray(law.deadband) != 0):
-        rest.append("a deadband is no kp and kd")
+        rest.append("a deadband cannot be expressed by kp and kd")
     for k, effect in enumerate(loop.effects):
         if isinstance(effect, DCMotor) and math.isfinite(float(effect.limit)):
-            rest.append("forcerange limits the command, and a current limit braking as well")
+            rest.append("forcerange limits the command only, a current limit also limits braking")
         elif not isinstance(effect, SAID):
             found[k] = _reason(effect)
     return found | ({-1: "; ".join(rest)} if rest else {})
@@ -115,10 +115,10 @@ def _reason(effect: AbstractEffect) -> str:
     if isinstance(effect, GearFriction | LoadDependentFriction):
         return "frictionloss does not grow with the load"
     if isinstance(effect, AbstractTransmission):
-        return "drive and link are one joint, with nothing that gives way between them"
+        return "drive and link are one rigid joint"
     if effect.on_link:
-        return "it is on the link, not on its drive: put it among the bodies"
-    return "there is no term for it"
+        return "it acts on the link, not on its drive: add it to the bodies"
+    return "the simulator has no such term"
 
 
 def _delivered(
@@ -126,7 +126,7 @@ def _delivered(
     command: Float[Array, " joints"],
     v: Float[Array, " joints"],
 ) -> Float[Array, " joints"]:
-    """Torque that the drives that can be expressed make of a command at a speed, `(joints,)`."""
+    """Torque at a command and a speed of the drives that can be expressed, `(joints,)`."""
     still = jnp.zeros_like(v)
     for effect in loop.effects:
         if isinstance(effect, DCMotor | DriveGain | TorqueSaturation):

@@ -1,9 +1,9 @@
 """Unrolls small array programs into programs of scalars, which compilers optimise far better.
 
-The physics of a few joints is a hundred sums and products. With arrays of two elements, most of
-the run time and compilation is spent on moving pairs of numbers. In unrolled form, a batch of
-recordings or of tangents is the only array axis left, and one instruction of a processor handles
-eight of its elements.
+The physics of a few joints is a hundred sums and products. With arrays of two elements, moving
+pairs of numbers takes most of the run time and of the compilation. In unrolled form the only array
+axis left is a batch of recordings or of tangents, and one processor instruction handles eight of
+its elements.
 """
 
 import math
@@ -55,7 +55,7 @@ def unrolled(fun: Callable[..., Any], *like: Any) -> Callable[..., Any]:
     structure = jax.tree.structure(shape)
     consts = [_Value.of(c) for c in closed.consts]
     for const in consts:
-        # Done here, since the first use may be inside a loop.
+        # Done here, because the first use may be inside a loop.
         const.scalars() if const.small else const.whole()
 
     def evaluate(*args: Any) -> Any:
@@ -177,7 +177,7 @@ class _Writer:
 
     def __init__(self, origin=None):
         self.seen: dict[Any, Any] = {}
-        # Keys contain `id`s, so the objects that these refer to must be kept alive.
+        # Keys contain `id`s, so the objects with these must stay alive.
         self.alive: list[Any] = []
         # The equation that is being evaluated; the outermost one if equations are nested.
         self.origin = origin

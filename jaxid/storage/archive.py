@@ -27,14 +27,14 @@ from .classes import Registry, agrees, hints, origin, rebuilt
 if TYPE_CHECKING:
     import pandas as pd
 
-# Increased whenever an older jaxid could not read the new files. Older formats stay readable: a
-# class whose fields changed their meaning has `of_format(format)`, which converts the object; one
-# whose fields changed their names has `fields_of_format(fields, format)`. 2: a loop stores held and
-# freed parameters by place instead of by name. 3: the smoothing of a sign is a speed instead of its
-# inverse.
+# Increased if an older jaxid cannot read the new files. Older formats stay readable: if the fields
+# of a class changed their meaning, its `of_format(format)` converts the object; if they changed
+# their names, its `fields_of_format(fields, format)` converts the fields.
+# 2: a loop stores held and freed parameters by place instead of by name.
+# 3: the smoothing of a sign is a speed instead of its inverse.
 FORMAT = 3
 
-# Everything but arrays; a story of many steps has about one megabyte.
+# Limit of the manifest, which contains all but arrays; a long story has about one megabyte.
 _LARGEST_MANIFEST = 256 * 2**20
 _PACKAGES = ("jaxid-robotics", "jax", "jaxlib", "equinox", "diffrax", "numpy", "scipy")
 
@@ -55,7 +55,7 @@ def pack(value: Any) -> bytes:
 
     The same tree gives the same bytes.
 
-    **Raises:** `SaveError` for what cannot be written without Python code, such as a function.
+    **Raises:** `SaveError` for values that need Python code, such as functions.
     """
     packer = _Packer()
     root = packer.node(value, "result")
@@ -83,7 +83,7 @@ class _Packer:
     def __init__(self) -> None:
         self.objects: list[dict[str, Any]] = []
         self.arrays: list[tuple[str, bytes]] = []
-        # The tree keeps its objects alive, so identities stay unique.
+        # The objects of the tree stay alive, so identities are unique.
         self._seen: dict[int, Any] = {}
 
     def node(self, value: Any, where: str) -> Any:
@@ -118,7 +118,7 @@ class _Packer:
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             return self._once(value, lambda: self._object(value, where))
         raise SaveError(
-            f"{where} is {value!r}, which a file of JSON and arrays cannot hold: save a result "
+            f"{where} is {value!r}, which cannot be stored as JSON or arrays: save a result "
             "without it"
         )
 
@@ -146,7 +146,7 @@ class _Packer:
         if array.dtype.kind not in "fiub":
             raise SaveError(f"{where} is an array of {array.dtype}: only numbers can be saved")
         buffer = io.BytesIO()
-        # One byte order, so that equal results are equal files.
+        # One byte order, so equal results give equal files.
         plain = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False))
         np.lib.format.write_array(buffer, plain.reshape(array.shape), allow_pickle=False)
         content = buffer.getvalue()
@@ -168,14 +168,14 @@ def _digest(content: bytes) -> str:
 
 
 def unpack(content: bytes, source: str, registry: Registry) -> Any:
-    """What `pack` was given.
+    """The value that `pack` was given.
 
     **Arguments:**
 
-    - `content`: the bytes of the file. `source`: what messages call it.
+    - `content`: the bytes of the file. `source`: its name in messages.
     - `registry`: the classes that it may contain; no others are accepted, and nothing is imported.
 
-    **Raises:** `SaveError` for whatever is wrong with the file.
+    **Raises:** `SaveError` for a file that is damaged, of a later format, or of other classes.
     """
     try:
         return _Unpacker(source, registry).read(content)
@@ -213,7 +213,7 @@ class _Unpacker:
         for k, digest in enumerate(manifest["arrays"]):
             self.arrays.append(self._array(members.get(f"{k}.npy", b""), digest, f"{k}.npy"))
         if len(members) != len(self.arrays) + 2:
-            raise self._damaged("it holds members that its manifest does not name")
+            raise self._damaged("it has members that its manifest does not name")
         for entry in manifest["objects"]:
             self.objects.append(self._object(entry))
         return self.value(manifest["root"])
@@ -228,14 +228,14 @@ class _Unpacker:
             if sum(e.file_size for e in entries) > len(content):
                 raise self._damaged("it would unpack to more than its own size")
             if len({e.filename for e in entries}) < len(entries):
-                raise self._damaged("it holds a member twice")
+                raise self._damaged("it has a member twice")
             members = {e.filename: archive.read(e) for e in entries}
         except SaveError:
             raise
         except Exception as error:  # zipfile may raise any exception for broken files
             raise _complaint(
                 self.source,
-                f"is cut off, damaged or not a saved result ({type(error).__name__}: {error})",
+                f"is truncated, damaged or not a saved result ({type(error).__name__}: {error})",
                 "save or copy it again",
             ) from error
         if "manifest.json" not in members:
@@ -251,7 +251,7 @@ class _Unpacker:
             by = by.get("jaxid-robotics", "") if isinstance(by, dict) else ""
             raise _complaint(
                 self.source,
-                f"is of format {written} (jaxid {by}), and this jaxid reads formats up to {FORMAT}",
+                f"is of format {written} (jaxid {by}), but this jaxid reads formats up to {FORMAT}",
                 "upgrade jaxid",
             )
         self.format = written
@@ -276,13 +276,13 @@ class _Unpacker:
         if found is None and package not in ("", "diffrax"):
             raise _complaint(
                 self.source,
-                f"holds an object of your class {name} (of {package})",
+                f"has an object of your class {name} (of {package})",
                 f"pass it: jaxid.load(path, classes=[{name}])",
             )
         if found is None:
             raise _complaint(
                 self.source,
-                f"holds a {name}, which this version of {package or 'jaxid'} does not have",
+                f"has a {name}, which this version of {package or 'jaxid'} does not have",
                 "load it with the version that wrote it",
             )
         return found
@@ -297,7 +297,7 @@ class _Unpacker:
             if name not in fields:
                 raise _complaint(
                     self.source,
-                    f"holds {cls.__name__} with a field {name}, which this version does not have",
+                    f"has a {cls.__name__} with a field {name}, which this version does not have",
                     "load it with the version that wrote it",
                 )
         made = rebuilt(cls, given)
@@ -333,7 +333,7 @@ class _Unpacker:
                     return cls[member]
             case {"frame": frame, "columns": columns, "index": index, "names": names}:
                 return self._frame(frame, columns, index, names)
-        raise self._damaged("its manifest holds an unknown kind of node")
+        raise self._damaged("its manifest has an unknown kind of node")
 
     def _on_device(self, k: int) -> jax.Array:
         # Objects that shared an array share it again.

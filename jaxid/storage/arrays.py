@@ -23,10 +23,10 @@ def npy(content: bytes) -> np.ndarray:
         raise ValueError(f"version {version} of .npy is not supported")
     shape, fortran, dtype = header[version](stream)
     if dtype.hasobject:
-        raise ValueError("it holds Python objects, which are refused")
+        raise ValueError("it contains Python objects, which are refused")
     size, there = math.prod(shape) * dtype.itemsize, len(content) - stream.tell()
     if any(n < 0 for n in shape) or size != there:
-        raise ValueError(f"its header promises {size} bytes of data and {there} are there")
+        raise ValueError(f"its header declares {size} bytes of data, but there are {there}")
     values = np.frombuffer(content, dtype, count=math.prod(shape), offset=stream.tell())
     shaped = values.reshape(shape[::-1]).T if fortran else values.reshape(shape)
     return shaped.copy()

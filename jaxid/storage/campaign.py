@@ -34,12 +34,12 @@ from .saved import registry
 
 try:
     import fcntl
-except ImportError:  # Windows has other locks; there a second process is not detected
+except ImportError:  # on Windows, which has other locks, a second process is not detected
     fcntl = None
 
-# Errors that depend on the input only, and are the same in every run; others are not results.
+# Errors that depend on the input only and recur in every run; other errors are not results.
 _VERDICTS = (JaxidError, ArithmeticError, np.linalg.LinAlgError)
-# Pieces that a worker computes before it is replaced: it keeps every program that it compiled.
+# A worker is replaced after this number of pieces, because it keeps every program that it compiled.
 # (The executor's max_tasks_per_child can deadlock, CPython issue 115634.)
 LIFE = 10
 
@@ -53,9 +53,9 @@ class Failed(eqx.Module):
 class Campaign:
     """A folder with the finished pieces of one long computation.
 
-    Every finished piece is written with checksums, under a temporary name and then renamed. A piece
-    that was written is not computed again; a damaged one is set aside and computed again. Only one
-    process at a time may use a folder.
+    Every finished piece is written with checksums under a temporary name, and then renamed. A saved
+    piece is not computed again. A damaged piece is renamed and computed again. Only one process at
+    a time may use a folder.
 
     Used as a context:
 
@@ -67,11 +67,11 @@ class Campaign:
     **Arguments:**
 
     - `folder`: created if it does not exist; None to save nothing.
-    - `plan`: all that determines the pieces: seeds, settings, models, recordings. A folder is
-      continued only with the same plan and the same versions of jaxid and its dependencies.
-    - `classes`: modules of your own that pieces may hold.
+    - `plan`: everything that determines the pieces: seeds, settings, models, recordings. A folder
+      can be continued only with the same plan and the same versions of jaxid and its dependencies.
+    - `classes`: your own modules that pieces may contain.
 
-    **Raises:** `SaveError` where the folder belongs to another plan or is in use.
+    **Raises:** `SaveError` if the folder belongs to another plan or is in use.
     """
 
     def __init__(
@@ -120,8 +120,8 @@ class Campaign:
         **Arguments:**
 
         - `name`: different for every piece.
-        - `work`: computes it; its result is a module, or numbers, text, arrays and containers of
-          these.
+        - `work`: computes the piece; the result is a module, or numbers, text, arrays and
+          containers of these.
         """
         found, value = self._stored(name)
         return value if found else self._keep(name, work())
@@ -140,11 +140,10 @@ class Campaign:
 
         **Arguments:**
 
-        - `work`: from an argument to a result; with several jobs, a function of a module.
+        - `work`: a function of one argument; with several jobs, one defined in a module.
         - `pieces`: arguments by name.
         - `jobs`: number of parallel processes.
-        - `executor`: used instead of processes; pieces that its workers cannot compute give a
-          `Failed`.
+        - `executor`: used instead of processes; pieces whose worker fails give a `Failed`.
         """
         left = {}
         for name, argument in pieces.items():
@@ -187,7 +186,7 @@ class Campaign:
         return True, held["value"]
 
     def _keep(self, name: str, value: Any) -> Any:
-        # Effects made by a catalogue's functions can be read once their classes are known.
+        # Registers classes made by functions of a catalogue, so that the piece can be read.
         self._classes |= classes_of(value)
         if self.folder is not None and not isinstance(value, _Died):
             content = archive.pack({"piece": name, "plan": self._key, "value": value})
@@ -223,12 +222,12 @@ class Campaign:
                     ended.add(name)
                     yield name, self._keep(name, value)
         except BrokenProcessPool:
-            # One of them ended its process; each is tried alone to find out which.
+            # One of them ended its process; each is tried alone to find it.
             for name in [name for name in left if name not in ended]:
                 try:
                     [(_, value)] = _from_pool(work, {name: left[name]}, 1)
                 except BrokenProcessPool:
-                    value = _Died("the process that worked on it was ended from outside")
+                    value = _Died("its process was ended from outside")
                 yield name, self._keep(name, value)
 
     # --- the folder -----------------------------------------------------------------------------
@@ -264,7 +263,7 @@ class Campaign:
         path = self.folder / "plan.json"
         if not path.exists():
             if any(self.folder.glob("*.piece")):
-                raise _problem(self.folder, "holds pieces and no plan.json", "give an empty folder")
+                raise _problem(self.folder, "has pieces but no plan.json", "give an empty folder")
             write_whole(path, text.encode())
             return
         try:
@@ -281,8 +280,8 @@ class Campaign:
         if changed:
             raise _problem(
                 self.folder,
-                f"holds the pieces of another computation (different: {', '.join(changed)})",
-                "give another folder, or the inputs that it was begun with",
+                f"has the pieces of another computation (different: {', '.join(changed)})",
+                "give another folder, or the inputs with which it was begun",
             )
 
 

@@ -68,7 +68,7 @@ def rebuilt(cls: type, given: Mapping[str, Any]) -> Any:
 
 
 def _or_default(value: Any, default: Any) -> Any:
-    """The default object itself if the value is equal, since equinox hides fields by identity."""
+    """The default object itself if the value is equal: equinox hides fields by identity."""
     if type(value) is not type(default):
         return value
     if isinstance(value, (str, int, float)):
@@ -78,13 +78,13 @@ def _or_default(value: Any, default: Any) -> Any:
 
 
 def hints(cls: type) -> dict[str, Any]:
-    """The annotations of a class; none where one of them names what is not there."""
+    """The annotations of a class; empty if one of them cannot be resolved."""
     import pandas as pd
 
     try:
         # jaxid's own classes import pandas for type checkers only.
         return typing.get_type_hints(cls, localns={"pd": pd})
-    except Exception:  # annotations of a user's class may name what only a type checker sees
+    except Exception:  # annotations of a user's class may have names for type checkers only
         return {}
 
 
@@ -105,7 +105,7 @@ def agrees(value: Any, hint: Any) -> bool:
         return len(of) == len(value) and all(map(agrees, value, of))
     plain = made_of or hint
     if plain in (int, float) or hasattr(plain, "array_type"):
-        # Under `vmap` a number becomes an array, and an array gets more axes.
+        # Under `vmap` numbers become arrays, and arrays get further axes.
         numbers = (int, float, np.ndarray, jax.Array)
         return isinstance(value, numbers) and not isinstance(value, bool)
     if isinstance(plain, type):

@@ -9,14 +9,14 @@ from ..errors import SaveError, sentence
 
 
 def write_whole(path: str | os.PathLike[str], content: bytes) -> Path:
-    """Writes a file under a temporary name and renames it, so an interruption keeps the old file.
+    """Writes a file under a temporary name and renames it; an interruption keeps the old file.
 
     **Arguments:**
 
     - `path`: its folder must exist; an existing file is replaced.
     - `content`: bytes of the whole file.
 
-    **Raises:** `SaveError` where it cannot be written.
+    **Raises:** `SaveError` if it cannot be written.
     """
     path = Path(path)
     # In the same folder: renaming is atomic only within one file system.
@@ -32,7 +32,7 @@ def write_whole(path: str | os.PathLike[str], content: bytes) -> Path:
             sentence(
                 str(path),
                 f"cannot be written ({error})",
-                "choose a folder that exists, has room and is yours to write in",
+                "choose an existing folder with free space and write permission",
             )
         ) from error
     finally:

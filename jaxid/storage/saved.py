@@ -15,7 +15,7 @@ from . import archive
 from .classes import registered
 from .files import write_whole
 
-# Larger than any result of a day's recordings, and small enough to be read on a laptop.
+# Larger than the result of a day of recordings, and small enough to be read on a laptop.
 LARGEST = 4 * 2**30
 
 
@@ -29,7 +29,7 @@ def save(result: eqx.Module, path: str | os.PathLike[str]) -> Path:
 
     **Returns:** the path.
 
-    **Raises:** `SaveError` where it cannot be written.
+    **Raises:** `SaveError` if it cannot be written.
     """
     return write_whole(path, archive.pack(result))
 
@@ -44,12 +44,12 @@ def load(
     **Arguments:**
 
     - `path`: the file.
-    - `classes`: arms, effects, controllers or methods of your own that the result holds.
+    - `classes`: your own arms, effects, controllers or methods that the result contains.
     - `largest`: size in bytes above which a file is refused; about three times that much memory
       is used.
 
-    **Raises:** `SaveError` for a file that is cut off, edited, too large, from a later version, or
-    of a class that was not given.
+    **Raises:** `SaveError` for a file that is truncated, edited, too large or of a later version,
+    or of a class that was not given.
     """
     source = str(path)
     try:
@@ -58,11 +58,11 @@ def load(
             raise SaveError(
                 sentence(
                     source,
-                    f"has {size} bytes, more than the {largest} that are read",
-                    f"pass largest={size} if it is yours",
+                    f"has {size} bytes, more than the limit of {largest}",
+                    f"pass largest={size} if you trust it",
                 )
             )
-        # One byte more than the size reveals a growing file or an endless device.
+        # One byte more than the size detects a growing file or an endless device.
         with open(path, "rb") as file:
             content = file.read(size + 1)
     except (OSError, ValueError, MemoryError) as error:
@@ -77,7 +77,7 @@ def load(
 
 
 def registry(classes: Iterable[type] = ()) -> dict[tuple[str, str], type]:
-    """The classes that a file may hold: jaxid's own, diffrax's steps, and those given."""
+    """The classes that a file may contain: jaxid's own, diffrax's steps, and those given."""
     # `import jaxid` imports these modules lazily, and only imported classes are found below.
     for room in ("discovery", "excitation"):
         importlib.import_module(f"jaxid.{room}")

@@ -47,7 +47,7 @@ def signals(
         title: Title of the whole figure.
     """
     if not panels or not all(panels):
-        raise ValueError("signals() draws panels of at least one trace each; one is empty.")
+        raise ValueError("signals() needs at least one trace in each panel; one is empty.")
     heights = [1.0 if any(t.role != "residual" for t in panel) else 0.5 for panel in panels]
     figure = go.Figure().set_subplots(
         rows=len(panels), cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=heights
@@ -86,7 +86,7 @@ def comparison(
         title: Title of the whole figure.
     """
     if len(acf) < 2 or np.any(np.abs(acf[0] - 1) > 1e-6):
-        raise ValueError("comparison() takes the autocorrelation from lag 0, where it is 1.")
+        raise ValueError("comparison() needs the autocorrelation from lag 0 on, where it is 1.")
     joints = len(joint_names)
     units = [unit] * joints if isinstance(unit, str) else list(unit)
     figure = _comparison_grid(joints)
@@ -145,7 +145,7 @@ def before_after(
     figure = go.Figure().set_subplots(
         rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[1.0, 0.7]
     )
-    # Each line is thinner than the one below it, so that all are visible where they agree.
+    # Each line is thinner than the one below it, so all are visible where they agree.
     lines = [("measured", measured, ROLE_LINES["measured"]["color"], 4.5)]
     if before is not None:
         lines.append(("before", before, ORANGE, 2.2))
@@ -201,13 +201,13 @@ def shares_in_time(
     unit: str = "N·m",
     title: str | None = None,
 ) -> go.Figure:
-    """Draw a residual, the part the first candidate explains, each candidate's share and the rest.
+    """Draw a residual with the part that the first candidate explains, all shares, and the rest.
 
     Arguments:
         time: Sampling times in s, shape `(samples,)`.
         residual: In `unit`, shape `(samples,)`.
-        shares: The part each candidate alone explains, in `unit`, shape `(samples,)`, by its name,
-            the leading one first.
+        shares: The part that each candidate explains on its own, in `unit`, shape `(samples,)`,
+            by name; the leading candidate is first.
         unit: As printed.
         title: Title of the whole figure.
     """
@@ -237,7 +237,7 @@ def shares_in_time(
 
 
 def _comparison_grid(joints: int) -> go.Figure:
-    """Give for each joint a high and a low panel on the left, and one beside both."""
+    """Give each joint a high and a low panel on the left, and one panel beside both."""
     return go.Figure().set_subplots(
         rows=2 * joints,
         cols=2,

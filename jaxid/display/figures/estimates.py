@@ -82,7 +82,7 @@ def deviance(
     x = np.linspace(min(values[0], centre - 3 * std), values[-1], 121)
     line = {"color": ORANGE, "dash": "dash"}
     parabola = ((x - centre) / std) ** 2
-    figure.add_scatter(x=x, y=parabola, name="as the deviation has it", mode="lines", line=line)
+    figure.add_scatter(x=x, y=parabola, name="from the deviation", mode="lines", line=line)
     marker = {"color": BLUE, "size": 9}
     figure.add_scatter(x=values, y=lost, name="profile", mode="markers", marker=marker)
     figure.add_hline(y=3.84, line={"color": INK, "dash": "dot"}, annotation_text="95 %")

@@ -86,7 +86,7 @@ def with_unit(name: str, unit: str) -> str:
 
 
 def bar(colour: str, pattern: str) -> dict:
-    """Give a bar coloured edges and hatching, and a pale fill so that lines across it are seen."""
+    """Give a bar coloured edges and hatching; the fill is pale, so lines across it are visible."""
     red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
     return {
         "color": f"rgba({red},{green},{blue},{0.15 if pattern else 0.4})",

@@ -105,7 +105,7 @@ def band_trace(name: str, x: np.ndarray, lower: np.ndarray, upper: np.ndarray) -
 def shade_gaps(
     figure: go.Figure, time: np.ndarray, traces: Sequence[Trace], name: str = "no data"
 ) -> None:
-    """Shade in the left column where the measured signals (or all, if none is) are all missing."""
+    """Shade times at which all measured signals are missing (all signals if none is measured)."""
     measured = [trace for trace in traces if trace.role == "measured"] or traces
     missing = np.ones(len(time), dtype=bool)
     for trace in measured:

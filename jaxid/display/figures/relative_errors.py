@@ -72,8 +72,8 @@ def error_falling(
 
     Arguments:
         steps: Effect that each step added; the starting model is first.
-        series: Relative error in %, shape `(steps, joints)`, by the name of the recordings it was
-            taken on: the first is drawn solid (fitted), the next dashed (held out).
+        series: Relative error in %, shape `(steps, joints)`, by the name of the recordings: the
+            first is drawn solid (fitted), the next dashed (held out).
         floor: Error in % due to noise alone, shape `(joints,)`; dotted.
         joint_names: As printed; "joint 1" and so on if absent.
         title: Title of the whole figure.
@@ -106,7 +106,7 @@ def error_falling(
     figure.update_xaxes(
         title_text="step",
         tickvals=place,
-        # A name of an effect is one word in tables; it is too long for one line here.
+        # Names of effects are too long for one line here.
         ticktext=[
             "<br>".join(wrap(step.replace("_", " "), 16, break_long_words=False)) for step in steps
         ],

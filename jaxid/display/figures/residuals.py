@@ -104,7 +104,8 @@ def dependence(
     middle = np.array([np.median(x[k]) for k in order])
     mean = np.array([np.mean(y[k]) for k in order])
     error = np.array([2 * np.std(y[k]) / np.sqrt(len(k)) for k in order])
-    # If the coordinate stands still, several bins share one position; a line needs distinct ones.
+    # If the coordinate is constant for a while, several bins have the same position; a line needs
+    # distinct ones.
     distinct = np.append(True, np.diff(middle) > 0)
     line = middle[distinct], mean[distinct], error[distinct]
     names = {"y_name": y_name, "curve_name": "mean", "title": title}

@@ -1,4 +1,4 @@
-"""J'J of a least-squares problem in which some unknowns concern one recording alone."""
+"""J'J of a least-squares problem in which some unknowns belong to one recording each."""
 
 from typing import Any
 
@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from ...linear_algebra import solve
 
-# Parameters, and what belongs to each recording: its initial position and velocity. The latter is
-# `(0, 0)` where nothing of the kind is estimated.
+# Parameters, and the initial position and velocity of each recording. The latter has the shape
+# `(0, 0)` if no initial states are estimated.
 Unknowns = tuple[Float[Any, " parameters"], Float[Any, "started estimated"]]
 
 
@@ -19,7 +19,7 @@ class Arrow(lx.AbstractLinearOperator):
     """A symmetric positive semi-definite operator of arrow shape, on `Unknowns`.
 
     - `dense`: rows and columns of the parameters.
-    - `blocks`: those of each recording's own unknowns.
+    - `blocks`: rows and columns of each recording's own unknowns.
     - `border`: rows of a recording's unknowns, columns of the parameters.
     """
 
@@ -35,7 +35,7 @@ class Arrow(lx.AbstractLinearOperator):
         return self.dense @ theta + across, down + jnp.einsum("rab,rb->ra", self.blocks, start)
 
     def as_matrix(self) -> Float[Any, "size size"]:
-        """All of it, parameters first."""
+        """The whole matrix, parameters first."""
         count, estimated, p = self.border.shape
         border = self.border.reshape(count * estimated, p)
         lower = jax.scipy.linalg.block_diag(*self.blocks) if count * estimated else border[:, :0]
@@ -46,23 +46,23 @@ class Arrow(lx.AbstractLinearOperator):
         return self
 
     def in_structure(self) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:
-        """Shapes of what it acts on."""
+        """Shapes of its input."""
         count, estimated, p = self.border.shape
         kind = self.dense.dtype
         return jax.ShapeDtypeStruct((p,), kind), jax.ShapeDtypeStruct((count, estimated), kind)
 
     def out_structure(self) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:
-        """Shapes of what it gives."""
+        """Shapes of its output."""
         return self.in_structure()
 
     def diagonal(self) -> Unknowns:
-        """Its diagonal, by unknown."""
+        """Its diagonal, as unknowns."""
         return jnp.diag(self.dense), jnp.einsum("raa->ra", self.blocks)
 
     def damped(self, damping: Float[Any, ""], scales: Unknowns) -> "Arrow":
-        """With the damped squares of the unknowns' scales added to the diagonal.
+        """The operator with damping times the squared scales of the unknowns added to the diagonal.
 
-        An unknown without a scale of its own changes nothing that is seen: one stands for it.
+        An unknown of zero scale does not affect the residual; one is added for it.
         """
         theta, start = (jnp.where(scale > 0, damping * scale, 1.0) for scale in scales)
         own = start[..., None] * jnp.eye(start.shape[-1])
@@ -75,14 +75,14 @@ class Arrow(lx.AbstractLinearOperator):
         Float[Any, " parameters"],
         Float[Any, "started estimated columns"],
     ]:
-        """The system that is left for the parameters once each recording's unknowns are eliminated.
+        """The system for the parameters after elimination of each recording's unknowns.
 
         **Arguments:**
 
         - `grad`: the right-hand side.
 
-        **Returns:** its matrix and right-hand side, and what the eliminated unknowns follow from:
-        they are the last column less the others times the parameters' part of the solution.
+        **Returns:** matrix, right-hand side, and columns from which the eliminated unknowns follow:
+        these are the last column minus the other columns times the parameters' solution.
         """
         theta, start = grad
         sides = jnp.concatenate([self.border, start[..., None]], axis=2)

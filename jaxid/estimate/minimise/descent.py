@@ -1,4 +1,4 @@
-"""The damped Gauss-Newton step inside bounds."""
+"""The damped Gauss-Newton step within bounds."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ Products = optx.FunctionInfo.EvalGradHessian
 
 
 class DescentState(eqx.Module):
-    """Where the step starts, its products, and the squared sizes of the columns of J so far."""
+    """Start of the step, its products, and the largest squared columns of J so far."""
 
     y: Unknowns
     f_info: Products
@@ -23,10 +23,11 @@ class DescentState(eqx.Module):
 
 
 class BoundedDescent(optx.AbstractDescent):
-    """Levenberg and Marquardt's step, in which bounds hold and initial states are eliminated.
+    """The step of Levenberg and Marquardt within bounds, with initial states eliminated.
 
-    Damping is one over the step size, scaled by the largest columns of J met so far (Moré 1978).
-    A parameter that would leave its bounds stops there, and the others compensate.
+    Damping is the inverse of the step size, scaled by the largest columns of J so far (Moré 1978).
+    A parameter that would leave its bounds stops at the bound, and the step of the others is
+    computed again.
 
     **Arguments:**
 
@@ -37,11 +38,11 @@ class BoundedDescent(optx.AbstractDescent):
     upper: Float[Any, " parameters"]
 
     def init(self, y: Unknowns, f_info_struct: Products) -> DescentState:
-        """A state before the first point; products are those given, of zeros."""
+        """A state before the first point, with products of zeros."""
         return DescentState(y, f_info_struct, f_info_struct.grad)
 
     def query(self, y: Unknowns, f_info: Products, state: DescentState) -> DescentState:
-        """Takes the products at an accepted point."""
+        """Stores the products at an accepted point."""
         assert isinstance(f_info.hessian, Arrow)
         sizes = f_info.hessian.diagonal()
         scales = jnp.maximum(sizes[0], state.scales[0]), jnp.maximum(sizes[1], state.scales[1])
@@ -64,7 +65,7 @@ def within(
     low: Float[Any, " parameters"],
     high: Float[Any, " parameters"],
 ) -> Float[Any, " parameters"]:
-    """The solution of `matrix step = -slope` for those that do not end on a bound."""
+    """The solution of `matrix step = -slope` for parameters that do not end on a bound."""
     size = jnp.diag(matrix)
     unit = jnp.sqrt(jnp.where(size > 0, size, 1.0))
     scaled = matrix / (unit * unit[:, None])
@@ -88,7 +89,7 @@ def within(
 
 
 def promised(diff: Unknowns, f_info: Products) -> Float[Any, ""]:
-    """How much a step should lower f by the quadratic that its products describe."""
+    """Decrease of f that the quadratic model of the products predicts for a step."""
     bent = f_info.hessian.mv(diff)
     along = optx.FunctionInfo.EvalGrad(f_info.f, f_info.grad).compute_grad_dot(diff)
     return -along - sum(jnp.vdot(a, b) for a, b in zip(diff, bent, strict=True)) / 2

@@ -1,4 +1,4 @@
-"""Unknowns filled up, so that the solver is compiled for few numbers of them."""
+"""Padding of unknowns, so the solver is compiled for few sizes."""
 
 from typing import Any
 
@@ -11,12 +11,12 @@ from .arrow import Arrow, Unknowns
 from .descent import Products
 from .problem import Problem, Sums
 
-# Unknowns are filled up to multiples of this many, so that few programs serve all models.
+# Unknowns are padded to multiples of this number, so few programs serve all models.
 _FILL = 8
 
 
 class Filling(eqx.Module):
-    """Fills unknowns up with some that nothing depends on, which stay where they are."""
+    """Pads unknowns with dummy unknowns, on which nothing depends and which do not change."""
 
     parameters: int = eqx.field(static=True)
     recordings: int = eqx.field(static=True)
@@ -32,13 +32,13 @@ class Filling(eqx.Module):
         return -self.parameters % _FILL, -self.recordings % _FILL
 
     def ends(self, bound: Float[Any, " parameters"], beyond: float) -> Float[np.ndarray, " filled"]:
-        """Bounds of all."""
+        """Bounds of all unknowns, with padding."""
         return np.append(bound, np.full(self._room()[0], beyond))
 
     def unknowns(
         self, y: Unknowns
     ) -> tuple[Float[Array, " filled"], Float[Array, "places estimated"]]:
-        """Values of all."""
+        """Values of all unknowns, with padding."""
         p, r = self._room()
         theta, start = np.pad(y[0], (0, p)), np.pad(y[1], ((0, r), (0, 0)))
         return jax.device_put((theta, start))
@@ -46,15 +46,15 @@ class Filling(eqx.Module):
     def emptied(
         self, y: tuple[Float[Any, " filled"], Float[Any, "places estimated"]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Values of those that there were."""
+        """Values without the padding."""
         return np.asarray(y[0])[: self.parameters], np.asarray(y[1])[: self.recordings]
 
     def products(self, sums: Sums, loss: Float[Any, ""]) -> Products:
-        """Products with all, of sums on the host.
+        """Padded products from sums on the host.
 
         **Arguments:**
 
-        - `loss`: infinite where the point is no good.
+        - `loss`: infinite if the point is not acceptable.
         """
         p, r = self._room()
         _, gram, slope, start_gram, start_slope, cross = sums.added()

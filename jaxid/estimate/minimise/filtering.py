@@ -1,4 +1,4 @@
-"""Noise filters along the samples, and the derivatives by their coefficients."""
+"""Noise filters along the samples, and derivatives by their coefficients."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ def known_rows(
 
     **Arguments:**
 
-    - `kept`: samples that count. `before`: how many came before these.
+    - `kept`: samples that count. `before`: number of earlier samples.
     """
     used = noise != 0 if noise.ndim == 2 else jnp.any(noise != 0, axis=1)
     taps = used.shape[1] - jnp.argmax(used[:, ::-1], axis=1) - 1
@@ -29,8 +29,8 @@ def known_rows(
 class Coefficients(eqx.Module):
     """Taps of the noise filter that are estimated with the parameters, padded to few lengths.
 
-    Coefficient c stands in row `row` for the past of `column`, `lag` samples back; `there` is
-    False for padding. The residual is linear in them: their columns are the residual's own past.
+    A coefficient multiplies output `column`, `lag` samples earlier, in row `row`; `there` is False
+    for padding. The residual is linear in the coefficients: their columns are its own past.
     """
 
     row: Int[Array, " coefficients"]
@@ -40,7 +40,7 @@ class Coefficients(eqx.Module):
 
     @classmethod
     def of(cls, orders: Sequence[int], full: bool) -> "Coefficients":
-        """The coefficients of filters of these orders, of full matrices of them if asked."""
+        """The coefficients of filters of these orders; with `full`, of matrices of filters."""
         n = len(orders)
         places = [
             (i, j, lag)
@@ -70,7 +70,7 @@ class Coefficients(eqx.Module):
     def derivative(
         self, raw: Float[Array, "recordings samples outputs"]
     ) -> Float[Array, "recordings samples outputs coefficients"]:
-        """Of the filtered residual by the coefficients."""
+        """Derivative of the filtered residual by the coefficients."""
         at = jnp.arange(raw.shape[1])[:, None] - self.lag
         past = raw[:, jnp.maximum(at, 0), self.column] * ((at >= 0) & self.there)
         rows = self.row == jnp.arange(raw.shape[2])[:, None]
@@ -80,7 +80,7 @@ class Coefficients(eqx.Module):
 def filtered_by(
     noise: Float[Array, "..."], x: Float[Array, "recordings samples outputs columns"]
 ) -> Float[Array, "recordings samples outputs columns"]:
-    """A(z) x along the samples; before the first sample all is zero."""
+    """A(z) x along the samples; earlier samples count as zero."""
 
     def passed(lag, x):
         a = noise[..., lag]
@@ -91,6 +91,6 @@ def filtered_by(
         known = jnp.arange(x.shape[1]) >= lag
         return total + passed(lag, jnp.where(known[:, None, None], earlier, 0.0))
 
-    # White noise, the usual case, has no second tap: what is not there is not paid for.
+    # Only taps that are used are computed; white noise, the usual case, has one.
     used = jnp.max(jnp.where(noise != 0, jnp.arange(noise.shape[-1]), 0))
     return jax.lax.fori_loop(1, used + 1, body, passed(0, x))

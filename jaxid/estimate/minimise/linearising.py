@@ -1,4 +1,4 @@
-"""A problem linearised over shares of its recordings: cores, devices, stretches of time."""
+"""Linearisation of a problem in parts: over cores, devices, or stretches of time."""
 
 import dataclasses
 from collections.abc import Callable
@@ -30,31 +30,31 @@ def linearise(
     theta: Float[Any, " parameters"],
     start: Float[Any, "recordings initials"],
 ) -> Sensitivity:
-    """Residual and derivatives at parameter values and initial states, all in memory."""
+    """Residual and all derivatives at parameter values and initial states."""
     return linearisation(problem, whole=True)(theta, start).found
 
 
 def with_derivatives(problem: Problem, point: Point) -> Sensitivity:
-    """Residual and derivatives at a point, computed again where they were not kept."""
+    """Residual and derivatives at a point, computed again if they were not kept."""
     if point.found.jacobian is not None:
         return point.found
     return linearise(problem, point.theta, point.start)
 
 
 def linearisation(problem: Problem, whole: bool = False) -> Callable[[Any, Any], Point]:
-    """The function that linearises a problem, which is shared out but once.
+    """The function that linearises a problem; the problem is distributed only once.
 
-    Recordings are shared out over the cores or over the problem's mesh. With a mesh every process
-    has the whole of it afterwards.
+    Recordings are distributed over the cores or over the problem's mesh. With a mesh every process
+    gets the whole result.
 
     **Arguments:**
 
-    - `whole`: keep all derivatives; otherwise only where they are small.
+    - `whole`: keep all derivatives; otherwise only if they are small.
     """
     mesh = problem.mesh
     if mesh is not None and not of_this_machine(mesh):
         return lambda theta, start: _over_mesh(problem, mesh, theta, start)
-    # Host devices would each compile the program, and take turns to put results together.
+    # Each host device would compile the program, and they would collect results one by one.
     problem = dataclasses.replace(problem, mesh=None)
     threads = cores() if mesh is None else mesh.size
     recordings, samples = problem.batch.mask.shape
@@ -73,12 +73,12 @@ def linearisation(problem: Problem, whole: bool = False) -> Callable[[Any, Any],
     return _Shared([_Part(_share(problem, row), kept) for row in rows], rows, threads)
 
 
-# Samples in all from which on threads gain more than they cost.
+# Total number of samples above which threads are faster.
 _WORTH_SHARING = 3000
-# Samples of one share, and intervals of a stretch of a longer recording: intermediate results of
-# more would be fresh memory each time.
+# Samples of one share, and intervals of a stretch of a longer recording. With more, intermediate
+# results would be allocated anew each time.
 _AT_A_TIME = _STRETCH = 40_000
-# Derivatives that are kept at every point, 64 MB of them.
+# Number of derivatives that are kept at every point, 64 MB.
 _KEPT = 8_000_000
 
 
@@ -99,7 +99,7 @@ class _Part(eqx.Module):
 
 
 class _Shared(eqx.Module):
-    """The linearisation of all recordings by shares, which threads take in turn."""
+    """The linearisation of all recordings in shares, on several threads."""
 
     parts: list[Any]
     rows: list[Int[np.ndarray, " rows"]]
@@ -120,7 +120,7 @@ class _Shared(eqx.Module):
 
         parts = at_once(part, range(len(self.parts)), self.threads)
         found, own = kept.whole(len(start))
-        # Where a step diverges, infinities of both signs meet: it is refused, and no warning.
+        # For a diverging step infinities of both signs are added; it is refused without a warning.
         with np.errstate(invalid="ignore"):
             loss, *sums = (np.sum(np.stack(x), axis=0) for x in zip(*parts, strict=True))
         own = (np.moveaxis(np.asarray(x), 0, 1) for x in own)
@@ -133,7 +133,7 @@ def _over_mesh(problem: Problem, mesh: Mesh, theta: Any, start: Any) -> Point:
 
 
 def _share(problem: Problem, rows: Int[np.ndarray, " rows"]) -> Problem:
-    """The problem of some recordings; one that comes again to fill up does not count."""
+    """The problem of some recordings; repetitions of a recording, as padding, do not count."""
     batch, free = taken((problem.batch, problem.free), rows)
     new: Bool[Array, "rows 1"] = jnp.asarray(np.append(True, np.diff(rows) > 0))[:, None]
     batch = dataclasses.replace(batch, mask=batch.mask & new)

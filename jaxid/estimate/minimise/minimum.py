@@ -1,4 +1,4 @@
-"""Solvers stepped by hand: progress, deadline and Ctrl-C between steps."""
+"""Minimisation step by step, with progress, deadline and Ctrl-C between steps."""
 
 import math
 import time
@@ -34,8 +34,8 @@ class Stopping(eqx.Module):
     - `tolerance`: stops when a step is shorter than this many standard deviations.
     - `worth`: stops when five steps together lower the loss by less than this share.
     - `max_steps`: largest number of points evaluated, refused ones included.
-    - `deadline`: of `time.perf_counter`, checked before every step.
-    - `solver`: of optimistix, instead of jaxid's, with its own tolerances.
+    - `deadline`: time of `time.perf_counter`, checked before every step.
+    - `solver`: solver of optimistix instead of jaxid's, with its own tolerances.
     """
 
     tolerance: float = 1e-2
@@ -66,11 +66,11 @@ def minimise(
     say: Callable[[str], None] = silent,
     known: Point | None = None,
 ) -> Minimum:
-    """The least squared error inside bounds, over parameters and initial states together.
+    """The least squared error within bounds, over parameters and initial states together.
 
     **Arguments:**
 
-    - `theta`, `start`: where to start, `(parameters,)` and `(recordings, 2 · joints)`.
+    - `theta`, `start`: start values, `(parameters,)` and `(recordings, 2 · joints)`.
     - `say`: called with a line for every step.
     - `known`: the linearisation at the start, if it exists.
     """
@@ -104,9 +104,9 @@ def descend(
 
     **Arguments:**
 
-    - `at`: what there is at some unknowns: anything with `sums` and `loss`.
-    - `point`: what there is at the first of them, `y`, filled up.
-    - `bounds`: of the parameters. `rows`: how many residuals there are.
+    - `at`: evaluation at unknowns; the result has `sums` and `loss`.
+    - `point`: the evaluation at the first unknowns `y`, which are padded.
+    - `bounds`: bounds of the parameters. `rows`: number of residuals.
     """
     lower, upper = bounds
     solver = LevenbergMarquardt(
@@ -117,7 +117,7 @@ def descend(
     state = _begun(solver, y)
     trial = point
     for k in range(1, settings.max_steps + 1):
-        # On the host, where these few numbers add up without a program for each shape.
+        # Sums of a few numbers on the host need no compiled program for each shape.
         sums, loss = jax.device_get((trial.sums, trial.loss))
         with np.errstate(over="ignore", invalid="ignore"):
             options = {"linearised": fill.products(sums, loss), "rows": np.float64(rows)}
@@ -136,7 +136,7 @@ def descend(
 
 
 def _unsimulated(point: Point) -> Minimum:
-    """The end of a minimisation at whose start the loop cannot be simulated, with the reason."""
+    """The result, with the reason, if the loop cannot be simulated at the start values."""
     codes = np.asarray(point.found.result)
     said = reason(int(codes.max(initial=0)))
     if not said:

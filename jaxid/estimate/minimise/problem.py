@@ -23,13 +23,13 @@ from .residual import Sensitivity, mixed, raw_residual, through_filter, unfilter
 
 
 class Sums(eqx.Module):
-    """Products of residual and derivatives, for each output on its own.
+    """Products of residual and derivatives, separately for each output.
 
-    Kept apart by output, they follow new weights of the outputs without another simulation.
+    They can be scaled to new weights of the outputs without another simulation.
 
     - `loss`: r'r. `gram`, `slope`: J'J and J'r of the parameters.
-    - `start_gram`, `start_slope`: those of each recording's initial state, and `cross` between
-      the two; of no recording where none is estimated.
+    - `start_gram`, `start_slope`: J'J and J'r of each recording's initial state. `cross`: J'J
+      between initial states and parameters. Empty if no initial state is estimated.
     """
 
     loss: Float[Any, " outputs"]
@@ -41,7 +41,7 @@ class Sums(eqx.Module):
 
     @classmethod
     def of(cls, found: Sensitivity, free: Float[Array, " recordings"]) -> "Sums":
-        """Of a linearisation.
+        """The products of a linearisation.
 
         **Arguments:**
 
@@ -68,17 +68,17 @@ class Sums(eqx.Module):
         return tuple(x.sum(axis=0) for x in fields)
 
     def products(self, loss: Float[Any, ""]) -> Products:
-        """Half the squared error, its gradient and J'J, of all outputs together.
+        """Half the squared error, its gradient and J'J, summed over all outputs.
 
         **Arguments:**
 
-        - `loss`: infinite where the point is not acceptable.
+        - `loss`: infinite if the point is not acceptable.
         """
         _, gram, slope, start_gram, start_slope, cross = self.added()
         return Products(loss / 2, (slope, start_slope), Arrow(gram, start_gram, cross))
 
     def weighted(self, ratio: Float[np.ndarray, " outputs"]) -> "Sums":
-        """With other weights of the outputs.
+        """The products for other weights of the outputs.
 
         **Arguments:**
 
@@ -95,9 +95,9 @@ class Point(eqx.Module):
     """A set of parameter values and initial states, and the least-squares problem around it.
 
     - `theta`: parameter values; `start`: initial position and velocity of each recording.
-    - `found`: residual and derivatives. The latter are None where they would fill the memory;
+    - `found`: residual and derivatives. The latter are None if they would fill the memory;
       `with_derivatives` gives them.
-    - `loss`: sum of squared weighted residuals; infinite where values are not physical or the
+    - `loss`: sum of squared weighted residuals; infinite if values are not physical or the
       simulation fails.
     """
 
@@ -109,14 +109,14 @@ class Point(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """The residual that is minimised, and the bounds of its parameters.
+    """The residual to minimise, and the bounds of its parameters.
 
     - `free`: one for recordings whose initial state is estimated, else zero.
-    - `mesh`: devices that share the recordings; None for one.
-    - `coefficients`: of the noise filter, estimated after the loop's parameters in one vector;
-      None where the filter is given.
-    - `mix`: makes filtered outputs white and uncorrelated, `(outputs, outputs)`; None where the
-      weights do all of it.
+    - `mesh`: devices that share the recordings; None for one device.
+    - `coefficients`: estimated coefficients of the noise filter, after the loop's parameters in one
+      vector; None if the filter is given.
+    - `mix`: matrix that makes filtered outputs white and uncorrelated, `(outputs, outputs)`; None
+      if the weights suffice.
     """
 
     loop: ClosedLoop
@@ -142,7 +142,7 @@ class Problem(eqx.Module):
         theta: Float[Any, " parameters"],
         start: Float[Any, "recordings initials"],
     ) -> Unknowns:
-        """The unknowns: parameters, and initial states where they are estimated."""
+        """The unknowns: parameters, and initial states if they are estimated."""
         estimated = start if self.free_start else jnp.zeros((0, 0))
         return jnp.asarray(theta), jnp.asarray(estimated)
 
@@ -155,7 +155,7 @@ class Problem(eqx.Module):
 
         **Arguments:**
 
-        - `kept`: samples that count. `before`: how many came before these.
+        - `kept`: samples that count. `before`: number of earlier samples.
         """
         before = jnp.zeros(len(kept), int) if before is None else before
         if self.coefficients is None:
@@ -186,7 +186,7 @@ class Problem(eqx.Module):
 
         **Arguments:**
 
-        - `known`: which filtered rows count, if others than of the whole recordings.
+        - `known`: filtered rows that count, if not those of whole recordings.
         """
         known = self.known(self.batch.kept) if known is None else known
         if self.coefficients is None:
@@ -208,12 +208,12 @@ class Problem(eqx.Module):
         """The point of a linearisation."""
         loop = self.loop.with_theta(theta[: self.loop.theta.shape[0]])
         sums = Sums.of(found, self.free)
-        # Squares overflow for a nearly diverging loop, whose derivatives are finite but useless.
+        # For a nearly diverging loop squares overflow; its derivatives are finite but useless.
         sound = jnp.isfinite(jnp.sum(sums.gram)) & jnp.isfinite(jnp.sum(sums.start_gram))
         loss = jnp.sum(sums.loss)
         sound = sound & jnp.isfinite(loss)
         if not imposed(loop):
-            # Inverse dynamics works for any inertia; a simulation needs a positive one.
+            # Inverse dynamics allows any inertia; a simulation needs a positive one.
             sound = sound & (loop.arm.smallest_inertia() > 0)
         return Point(theta, start, found, sums, jnp.where(sound, loss, jnp.inf))
 
@@ -224,7 +224,7 @@ def point_around(
     theta: Float[Array, " parameters"],
     start: Float[Array, "recordings initials"],
 ) -> Point:
-    """A problem linearised as one compiled function, also for use in others."""
+    """A linearised problem by one compiled function, which other functions may call."""
     n, own = problem.loop.joints, problem.loop.theta.shape[0]
     loop = problem.loop.with_theta(theta[:own])
     batch = dataclasses.replace(problem.batch, q0=start[:, :n], v0=start[:, n:])
@@ -248,12 +248,12 @@ def residual_at(
 
 
 def reweighted(problem: Problem, point: Point, ratio: Float[Any, " outputs"]) -> Point:
-    """The linearisation of a problem that has other weights, without another simulation.
+    """The linearisation of a problem with new weights, without another simulation.
 
     **Arguments:**
 
-    - `point`: of the problem with its former weights.
-    - `ratio`: new weights over former ones. What a mix makes white knows no weights.
+    - `point`: the linearisation with the former weights.
+    - `ratio`: new weights over former ones; not used with a mix, which has no weights.
     """
     raw = np.asarray(ratio)
     scale = raw if problem.mix is None else np.ones_like(raw)

@@ -16,7 +16,7 @@ from ...simulation.runs import each, run, run_with_sensitivities
 from .filtering import filtered_by, known_rows
 
 if TYPE_CHECKING:
-    # Callers know that derivatives were kept; the type checker does not.
+    # The type checker does not know that derivatives were kept.
     ByParameters: TypeAlias = Any
     ByStart: TypeAlias = Any
 else:
@@ -27,8 +27,8 @@ else:
 class Sensitivity(eqx.Module):
     """Weighted residual of a batch and its derivatives, at one set of parameter values.
 
-    `residual` is zero where there is no sample; `start` is its derivative by each recording's own
-    initial position and velocity, None where it is not estimated. `raw` is the residual before the
+    `residual` is zero at padding; `start` is its derivative by each recording's own
+    initial position and velocity, None if it is not estimated. `raw` is the residual before the
     noise filter. Derivatives that were not kept are None. `result` is zero for recordings whose
     simulation succeeded, see `jaxid.simulation.reason`.
     """
@@ -49,11 +49,11 @@ def sensitivity(
     signals: tuple[str, ...],
     free_start: bool,
 ) -> Sensitivity:
-    """Weighted residual (measured less simulated) and its exact derivatives.
+    """Weighted residual (measured minus simulated) and its exact derivatives.
 
     **Arguments:**
 
-    - `weights`: one over the deviation of each output, `(signals · joints,)`.
+    - `weights`: inverse deviation of each output, `(signals · joints,)`.
     - `noise`: the polynomial A of each output's noise filter 1/A, padded with zeros.
     - `signals`: which of `"tau"` and `"q"` are outputs.
     - `free_start`: whether initial states are parameters too.
@@ -71,7 +71,7 @@ def unfiltered(
     signals: tuple[str, ...],
     free_start: bool,
 ) -> Sensitivity:
-    """`sensitivity` before any noise filter: the only pass through the simulation."""
+    """`sensitivity` before any noise filter; this is the only simulation."""
     x, tangents = beginning(loop, batch, free_start)
     return sensitivity_from(loop, batch, weights, signals, x, tangents)[0]
 
@@ -79,9 +79,9 @@ def unfiltered(
 def beginning(
     loop: ClosedLoop, batch: Batch, free_start: bool
 ) -> tuple[Float[Array, "recordings states"], Float[Array, "recordings states columns"]]:
-    """States in which recordings begin, and their derivatives.
+    """Initial states of recordings, and their derivatives.
 
-    Columns are the loop's parameters and, where it is estimated, the initial position and velocity.
+    Columns are the loop's parameters and, if estimated, the initial position and velocity.
     """
     p, n = loop.theta.shape[0], loop.joints
 
@@ -106,7 +106,7 @@ def sensitivity_from(
 ) -> tuple[
     Sensitivity, Float[Array, "recordings states"], Float[Array, "recordings states columns"]
 ]:
-    """`unfiltered` from given states and tangents on, and those with which it ends."""
+    """`unfiltered` from given states and tangents; also returns those at the end."""
     rows = tuple(SIGNALS.index(s) for s in signals)
     p, n = loop.theta.shape[0], loop.joints
 
@@ -157,9 +157,9 @@ def through_filter(
 
     **Arguments:**
 
-    - `noise`: polynomials, `(outputs, taps)`, or matrices of them where one output's noise
-      drives another's, `(outputs, outputs, taps)`; padded with zeros.
-    - `known`: which filtered rows count.
+    - `noise`: polynomials, `(outputs, taps)`, or matrices of polynomials for coupled outputs,
+      `(outputs, outputs, taps)`; padded with zeros.
+    - `known`: filtered rows that count.
     """
     p = plain.jacobian.shape[-1]
     columns = [plain.raw[..., None], plain.jacobian]
@@ -183,7 +183,7 @@ def absorb_start(found: Sensitivity, free: Float[Array, " recordings"]) -> Sensi
     count, p = found.jacobian.shape[0], found.jacobian.shape[-1]
     j = found.jacobian.reshape(count, -1, p)
     s = (found.start * free[:, None, None, None]).reshape(count, j.shape[1], -1)
-    # Columns may be dependent, or zero where a start is given, so a full decomposition is needed.
+    # Columns may be dependent, or zero for a given start, so a full decomposition is needed.
     basis, size = jax.vmap(column_basis)(s)
     basis = jnp.where((size > 1e-10 * size[:, :1])[:, None, :], basis, 0.0)
     j = j - basis @ jnp.einsum("rka,rkp->rap", basis, j)

@@ -12,7 +12,7 @@ from .descent import Products, promised
 
 
 class SearchState(eqx.Module):
-    """The damping, and how much it grows where the next step is refused."""
+    """The damping, and the factor by which it grows if the next step is refused."""
 
     damping: Float[Any, ""]
     growth: Float[Any, ""]
@@ -27,7 +27,7 @@ class Nielsen(optx.AbstractSearch):
     **Arguments:**
 
     - `first`: damping of the first step, in units of the squared columns of J.
-    - `least`: damping never falls below this.
+    - `least`: lower bound of the damping.
     """
 
     first: float = 1e-3

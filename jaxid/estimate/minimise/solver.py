@@ -1,4 +1,4 @@
-"""Levenberg–Marquardt as an optimistix solver that stops in standard deviations."""
+"""Levenberg–Marquardt as an optimistix solver whose tolerance is in standard deviations."""
 
 from typing import Any
 
@@ -22,12 +22,12 @@ LARGEST_DAMPING = 1e12
 
 
 class SolverState(eqx.Module):
-    """What the solver carries from step to step.
+    """The state of the solver between steps.
 
-    - `y_eval`: the point to be evaluated next. `first`: whether none was evaluated yet.
-    - `f_info`: products at the last accepted point; `accepted`: whether that is the newest.
-    - `result`: divergence where no step lowers the loss, however short.
-    - `losses`: of the last accepted points, newest last; infinite before there are as many.
+    - `y_eval`: the next point to evaluate. `first`: whether no point was evaluated yet.
+    - `f_info`: products at the last accepted point; `accepted`: whether this is the newest point.
+    - `result`: divergence if even the shortest step does not lower the loss.
+    - `losses`: losses of the last accepted points, newest last, with infinity for missing points.
     """
 
     y_eval: Unknowns
@@ -43,23 +43,23 @@ class SolverState(eqx.Module):
 
 
 class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
-    """Damped Gauss-Newton steps inside bounds, for parameters and initial states together.
+    """Damped Gauss-Newton steps within bounds, for parameters and initial states together.
 
-    Unknowns are `(parameters, initial states by recording)`; the latter `(0, 0)` where there are
-    none. Supports the following `options`:
+    Unknowns are `(parameters, initial states by recording)`; the latter have the shape `(0, 0)` if
+    there are none. Supports the following `options`:
 
-    - `linearised`: `optimistix.FunctionInfo.EvalGradHessian` at the point to be evaluated, with
-      an `Arrow` for J'J, where the caller computes it (over threads, devices or pieces of a
-      recording); `fn` is not called then. By default by forward mode through `fn`.
-    - `rows`: how many residuals are not padding; by default all.
+    - `linearised`: `optimistix.FunctionInfo.EvalGradHessian` at the point to evaluate, with an
+      `Arrow` for J'J, if the caller computes it (over threads, devices or pieces of a recording);
+      `fn` is then not called. By default it is computed by forward mode through `fn`.
+    - `rows`: number of residuals without padding; by default all.
 
     **Arguments:**
 
     - `descent`: the step for a given damping. `search`: the damping.
-    - `tolerance`: it stops where a full step promises less than this many standard deviations, or
-    - `worth`: where five accepted steps together lower the loss by less than this share. Where
-      friction sticks, the loss has kinks: full steps keep promising what small ones do not find.
-    - `rtol`, `atol`, `norm`: of optimistix' interface; they are not used.
+    - `tolerance`: it stops if a full step is shorter than this many standard deviations.
+    - `worth`: it also stops if five accepted steps together lower the loss by less than this share.
+      With sticking friction the loss has kinks, at which full steps stay long without a decrease.
+    - `rtol`, `atol`, `norm`: required by optimistix; they are not used.
     """
 
     descent: BoundedDescent
@@ -89,7 +89,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
 
     def step(self, fn: Any, y: Unknowns, args, options, state: SolverState, tags):
-        """Evaluates the trial point, accepts or refuses it, and makes the next one."""
+        """Evaluates the trial point, accepts or refuses it, and proposes the next one."""
         if "linearised" in options:
             found, rows, aux = options["linearised"], options["rows"], None
         else:
@@ -105,11 +105,12 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         descent = chosen(self.descent.query(y, found, state.descent), state.descent)
         f_info = chosen(found, state.f_info)
         losses = jnp.where(accepted, jnp.append(state.losses[1:], 2 * f_info.f), state.losses)
-        # Both steps by one piece of code, which is most of the program.
+        # One compiled piece of code for both steps; it is most of the program.
         sizes = jnp.stack([size, jnp.full_like(size, FULL)])
         diffs = jax.lax.map(lambda x: self.descent.step(x, descent)[0], sizes)
         diff, full = (jax.tree.map(lambda x, k=k: x[k], diffs) for k in (0, 1))
-        # A full step's promise is its squared length in deviations times the residual's variance.
+        # The predicted decrease of a full step is half its squared length in deviations times the
+        # residual's variance.
         settled = 2 * promised(full, f_info) <= self.tolerance**2 * losses[-1] / rows
         flat = losses[0] - losses[-1] < self.worth * losses[-1]
         stuck = search.damping > LARGEST_DAMPING
@@ -138,7 +139,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def postprocess(
         self, fn: Any, y: Unknowns, aux, args, options, state: SolverState, tags, result
     ):
-        """What `optimistix.least_squares` hands out."""
+        """The result for `optimistix.least_squares`."""
         return y, aux, {}
 
 

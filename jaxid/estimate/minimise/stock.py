@@ -1,4 +1,4 @@
-"""The problem for optimistix' own solvers: a function without bounds."""
+"""The problem in a form without bounds, for optimistix' own solvers."""
 
 from typing import Any
 
@@ -15,17 +15,17 @@ from .problem import Problem, point_around, residual_at
 
 
 def check_solver(solver: Any, mesh: Mesh | None) -> None:
-    """Refuses objects that cannot minimise a squared error.
+    """Checks that an object can minimise a squared error.
 
-    **Raises:** `FitError` for another object than a solver of optimistix, and where devices are to
-    share the recordings, which only jaxid's own does.
+    **Raises:** `FitError` for an object that is not a solver of optimistix, or with a mesh, which
+    only jaxid's own solver supports.
     """
     if solver is None:
         return
     if not isinstance(solver, (optx.AbstractLeastSquaresSolver, optx.AbstractMinimiser)):
         raise FitError(
-            f"{solver!r} is no solver: give one of optimistix for least squares or minimisation, "
-            "such as optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8), or None for jaxid's own"
+            f"{solver!r} is not a solver: give an optimistix solver for least squares or "
+            "minimisation, such as optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8), or None"
         )
     if mesh is not None:
         raise FitError(
@@ -37,10 +37,10 @@ def check_solver(solver: Any, mesh: Mesh | None) -> None:
 class Transformed(eqx.Module):
     """A problem in coordinates without bounds.
 
-    Forward and reverse mode both go through one Jacobian, by forward mode through the simulation.
+    Forward and reverse mode both use one Jacobian, computed by forward mode through the simulation.
 
     - `bounds`: maps coordinates to parameter values.
-    - `start`: initial states where none is estimated.
+    - `start`: initial states that are not estimated.
     """
 
     problem: Problem
@@ -49,9 +49,9 @@ class Transformed(eqx.Module):
 
     @classmethod
     def of(cls, problem: Problem, start: Float[Any, "recordings initials"]) -> "Transformed":
-        """A problem with its initial states."""
+        """The transformed problem, with given initial states."""
         scale = Bounds.of(problem.loop.free_parameters).scale
-        # Coefficients of a noise filter have no bounds, and are about one.
+        # Coefficients of a noise filter have no bounds, and are of order one.
         scale = jnp.append(scale, jnp.ones(problem.lower.shape[0] - scale.shape[0]))
         bounds = Bounds(problem.lower, problem.upper, scale)
         return cls(problem, bounds, jnp.asarray(start))
@@ -74,7 +74,7 @@ class Transformed(eqx.Module):
         return _residual(self.inside(z), self.problem), None
 
     def loss(self, z: Unknowns, args: None) -> tuple[Float[Array, ""], None]:
-        """Half its square."""
+        """Half the squared residual."""
         residual, _ = self.residual(z, args)
         return 0.5 * jnp.sum(residual**2), None
 

@@ -1,7 +1,7 @@
-"""Long recordings linearised one stretch of time after the other.
+"""Linearisation of long recordings in stretches of time, one after the other.
 
-Memory is needed for one stretch only. A stretch begins with the final state and tangents of the
-previous one, and with the past rows that its noise filter needs.
+Only one stretch is in memory. A stretch begins with the final state and tangents of the previous
+one, and with the past rows that its noise filter needs.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ class Carried(eqx.Module):
 
     - `x`, `tangents`: the loop's state and its derivatives.
     - `past`: last rows of the residual and its derivatives before the noise filter.
-    - `count`: samples that came before.
+    - `count`: number of earlier samples.
     """
 
     x: Float[Array, "recordings states"]
@@ -39,11 +39,11 @@ def begun(
     theta: Float[Array, " parameters"],
     start: Float[Array, "recordings initials"],
 ) -> Carried:
-    """Before the first stretch.
+    """The state before the first stretch.
 
     **Arguments:**
 
-    - `problem`: of which the first stretch is enough.
+    - `problem`: at least its first stretch.
     """
     n, own = problem.loop.joints, problem.loop.theta.shape[0]
     loop = problem.loop.with_theta(theta[:own])
@@ -58,7 +58,7 @@ def begun(
 def along(
     problem: Problem, theta: Float[Array, " parameters"], carried: Carried
 ) -> tuple[Sums, Bool[Array, ""], Sensitivity, Carried]:
-    """One stretch: its sums, whether they are sound, its rows, and what the next one needs."""
+    """One stretch: its sums, whether they are finite, its rows, and the state for the next one."""
     own, kept = problem.loop.theta.shape[0], problem.batch.kept
     loop = problem.loop.with_theta(theta[:own])
     plain, x, tangents = sensitivity_from(
@@ -81,7 +81,7 @@ def along(
     found = problem.whitened(wide, theta[own:], known)
     found = jax.tree.map(lambda leaf: leaf[:, taps:] if leaf.ndim > 1 else leaf, found)
     count = jnp.sum(kept, axis=1)
-    # Samples come first and padding after them, so that the last rows begin after so many.
+    # Samples come before padding, so the last `taps` of all rows begin at row `count`.
     last = jax.vmap(lambda r, n: jax.lax.dynamic_slice_in_dim(r, n, taps))(rows, count)
     point = problem.around(theta, carried.x, found)
     following = Carried(x, tangents, last, carried.count + count)
@@ -89,10 +89,10 @@ def along(
 
 
 class Stretches(eqx.Module):
-    """A problem of one recording, cut when it is linearised.
+    """A problem of one recording, cut into stretches when it is linearised.
 
-    - `host`: its recording in NumPy's hands, which cut it without compiling.
-    - `size`: intervals of a stretch. `most`: largest number of samples in one.
+    - `host`: its recording as NumPy arrays, which are cut without compilation.
+    - `size`: number of intervals of a stretch. `most`: largest number of samples in a stretch.
     """
 
     problem: Problem
@@ -103,11 +103,11 @@ class Stretches(eqx.Module):
 
     @classmethod
     def of(cls, problem: Problem, size: int, whole: bool) -> "Stretches":
-        """A problem to be cut.
+        """The stretches of a problem.
 
         **Arguments:**
 
-        - `size`: intervals of a stretch. `whole`: whether derivatives are kept.
+        - `size`: number of intervals of a stretch. `whole`: whether derivatives are kept.
         """
         host = jax.tree.map(np.asarray, problem.batch)
         most = int(np.bincount(_at(host)[host.mask] // size).max())
@@ -116,7 +116,7 @@ class Stretches(eqx.Module):
     def __call__(
         self, theta: Float[Any, " parameters"], start: Float[Any, "recordings initials"]
     ) -> Point:
-        """The point, with derivatives only where they are to be kept."""
+        """The linearised point, with derivatives only if they are kept."""
         intervals = self.host.intervals.h.shape[1]
         carried, total, found, sound = None, None, None, True
         for first in range(0, intervals, self.size):
@@ -146,18 +146,18 @@ class Stretches(eqx.Module):
         if piece.ndim > 1:
             room[:, rows] = np.asarray(piece)[:, : len(rows)]
         else:
-            # Once a stretch has failed, all that follow have too.
+            # After a failed stretch, all later ones have failed too.
             room[:] = np.maximum(room, piece)
 
     def _stretch(self, first: int) -> tuple[Problem, Int[np.ndarray, " rows"]]:
-        """The problem from a grid point on, and which samples it has."""
+        """The problem of the stretch from a grid point on, and its samples."""
         batch, last = self.host, first + self.size
         at = _at(batch)
         there = np.asarray(batch.mask) & (at >= first) & (at < last)
         rows = np.flatnonzero(there.any(axis=0))
 
         def cut(leaf: Any) -> Any:
-            # The last point is where the stretch ends; beyond a recording's end none is left.
+            # The last point is the end of the stretch; indices stop at the recording's end.
             return leaf[:, np.minimum(np.arange(first, last + 1), leaf.shape[1] - 1)]
 
         def sampled(leaf: Any) -> Any:
@@ -177,7 +177,7 @@ class Stretches(eqx.Module):
 
 
 def _at(batch: Batch) -> Int[np.ndarray, "recordings samples"]:
-    """Which grid point each sample is."""
+    """The grid point of each sample."""
     if batch.at is not None:
         return np.asarray(batch.at)
     return np.broadcast_to(np.arange(batch.mask.shape[1]), batch.mask.shape)
