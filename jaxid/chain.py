@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .parameters import as_float64
@@ -37,7 +38,7 @@ class Chain(eqx.Module):
         self, q: Float[Array, " joints"]
     ) -> tuple[Float[Array, "joints 3 3"], Float[Array, "joints 3"], Float[Array, "joints 3"]]:
         """Rotation and origin of each link, and its joint's axis, in the base's frame."""
-        turn, place = jnp.eye(3), jnp.zeros(3)
+        turn, place = np.eye(3), np.zeros(3)
         turns, places, axes = [], [], []
         for k, slides in enumerate(self.slides):
             place = place + turn @ self.offsets[k]
@@ -48,7 +49,7 @@ class Chain(eqx.Module):
             else:
                 cross = _cross_matrix(self.axes[k])
                 turn = turn @ (
-                    jnp.eye(3) + jnp.sin(q[k]) * cross + (1 - jnp.cos(q[k])) * cross @ cross
+                    np.eye(3) + jnp.sin(q[k]) * cross + (1 - jnp.cos(q[k])) * cross @ cross
                 )
             turns.append(turn)
             places.append(place)
@@ -72,13 +73,13 @@ class Chain(eqx.Module):
         - `q`, `v`, `a`: position, velocity, acceleration, rad or m and per s.
         """
         turns, places, axes = self.frames(q)
-        slides = jnp.asarray(self.slides)[:, None]
-        turning, sliding = jnp.where(slides, 0.0, axes), jnp.where(slides, axes, 0.0)
+        turning, sliding = self._apart(axes)
         rate = jnp.cumsum(turning * v[:, None], axis=0)
-        before = jnp.concatenate([jnp.zeros((1, 3)), rate[:-1]])
+        still = np.zeros((1, 3))
+        before = jnp.concatenate([still, rate[:-1]])
         spin = jnp.cumsum(turning * a[:, None] + jnp.cross(before, turning * v[:, None]), axis=0)
-        before_spin = jnp.concatenate([jnp.zeros((1, 3)), spin[:-1]])
-        arm = jnp.diff(places, axis=0, prepend=jnp.zeros((1, 3)))
+        before_spin = jnp.concatenate([still, spin[:-1]])
+        arm = jnp.diff(places, axis=0, prepend=still)
         moved = jnp.cross(before_spin, arm) + jnp.cross(before, jnp.cross(before, arm))
         along = sliding * a[:, None] + 2 * jnp.cross(before, sliding * v[:, None])
         lift = jnp.cumsum(moved + along, axis=0) - self.gravity
@@ -96,18 +97,25 @@ class Chain(eqx.Module):
         at_joint = about_base - jnp.cross(places, beyond)
         return jnp.sum(turning * at_joint + sliding * beyond, axis=1)
 
+    def _apart(
+        self, axes: Float[Array, "joints 3"]
+    ) -> tuple[Float[Array, "joints 3"], Float[Array, "joints 3"]]:
+        """Axes of the joints that turn, and of those that slide; zero for the others."""
+        # Constant zeros, with which a simulation's kernel does not multiply.
+        slides, none = np.array(self.slides)[:, None], np.zeros((self.joints, 3))
+        return jnp.where(slides, none, axes), jnp.where(slides, axes, none)
+
     def mass_matrix(
         self, bodies: Float[Array, "joints 10"], q: Float[Array, " joints"]
     ) -> Float[Array, "joints joints"]:
         """Inertia at q, `(joints, joints)`, by composite bodies about the base's origin."""
         turns, places, axes = self.frames(q)
-        slides = jnp.asarray(self.slides)[:, None]
-        turning = jnp.where(slides, 0.0, axes)
-        passing = jnp.where(slides, axes, jnp.cross(places, axes))
+        turning, _ = self._apart(axes)
+        passing = jnp.where(np.array(self.slides)[:, None], axes, jnp.cross(places, axes))
         inertia, moment, mass = _in_base(bodies, turns)
-        shift = 2 * jnp.einsum("ki,ki->k", places, moment)[:, None, None] * jnp.eye(3)
+        shift = 2 * jnp.einsum("ki,ki->k", places, moment)[:, None, None] * np.eye(3)
         both = jnp.einsum("ki,kj->kij", places, moment)
-        square = jnp.einsum("ki,ki->k", places, places)[:, None, None] * jnp.eye(3)
+        square = jnp.einsum("ki,ki->k", places, places)[:, None, None] * np.eye(3)
         own = square - jnp.einsum("ki,kj->kij", places, places)
         inertia = inertia + shift - both - both.mT + mass[:, :, None] * own
         moment = moment + mass * places
@@ -145,8 +153,8 @@ def moved_body(body: Float[Array, "10"], place: Float[Array, "3"]) -> Float[Arra
     return jnp.concatenate([body[:6] + shift[jnp.triu_indices(3)], moment + mass * place, body[9:]])
 
 
-def _cross_matrix(x: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    return jnp.cross(jnp.eye(3), x)
+def _cross_matrix(x: Float[Array | np.ndarray, "3"]) -> Float[Array, "3 3"]:
+    return jnp.cross(np.eye(3), x)
 
 
 def _in_base(

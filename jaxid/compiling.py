@@ -1,5 +1,6 @@
 """How XLA compiles jaxid's programs, and the one flag that `import jaxid` sets in the process."""
 
+import copy
 import functools
 import os
 import threading
@@ -63,26 +64,80 @@ def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result
 
     **Arguments:**
 
-    - `fun`: a pure function; arrays are traced, everything else is static.
+    - `fun`: a pure function; arrays are traced, everything else is static. So are the arrays of
+      fields that a class names in `constants`: what is known of them shortens the program.
     """
+
+    def with_arrays(leaves: list[Any], structure: Any) -> _Result:
+        args, kwargs = jax.tree.unflatten(structure, map(_as_arrays, leaves))
+        return fun(*args, **kwargs)
+
+    # By which profiles and caches of compiled programs call it.
+    with_arrays.__name__ = with_arrays.__qualname__ = fun.__name__
 
     # Made at the first call: two dozen such functions would noticeably slow down `import jaxid`.
     @functools.cache
-    def jitted(outermost: bool) -> Callable[_Arguments, _Result]:
+    def jitted(outermost: bool) -> Callable[[list[Any], Any], _Result]:
         options = _options() if outermost else {}
         given: dict[str, Any] = {"compiler_options": options} if options else {}
-        return eqx.filter_jit(fun, **given)
+        return eqx.filter_jit(with_arrays, **given)
 
     once = _Once()
 
     @functools.wraps(fun)
     def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        run = functools.partial(jitted(_nothing_is_traced()), *args, **kwargs)
+        leaves, structure = jax.tree.flatten((args, kwargs), is_leaf=_has_constants)
+        leaves = list(map(_as_constants, leaves))
+        run = functools.partial(jitted(_nothing_is_traced()), leaves, structure)
         if threading.current_thread() is threading.main_thread():
             return run()
-        return once.first_alone(run, (args, kwargs))
+        return once.first_alone(run, (leaves, structure))
 
     return call
+
+
+class _Constant:
+    """Arrays as a part of the program; equal if they have the same structure and values."""
+
+    def __init__(self, tree: Any):
+        leaves, structure = jax.tree.flatten(tree)
+        arrays = [np.asarray(leaf) for leaf in leaves]
+        self.tree = jax.tree.unflatten(structure, arrays)
+        self.key = structure, tuple((x.shape, x.dtype.str, x.tobytes()) for x in arrays)
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, _Constant) and self.key == other.key
+
+
+def _has_constants(tree: Any) -> bool:
+    """Whether a module names fields that are `constants` of compiled programs."""
+    return bool(getattr(type(tree), "constants", ()))
+
+
+def _as_constants(module: Any) -> Any:
+    """A module with its constants as a part of the program; anything else is left unchanged."""
+    names = getattr(type(module), "constants", ())
+    fields = {name: vars(module)[name] for name in names}
+    if not names or any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(fields)):
+        return module
+    return _with_fields(module, {name: _Constant(value) for name, value in fields.items()})
+
+
+def _as_arrays(module: Any) -> Any:
+    """The inverse of `_as_constants`, within the program."""
+    names = getattr(type(module), "constants", ())
+    fields = {n: x.tree for n in names if isinstance(x := vars(module)[n], _Constant)}
+    return _with_fields(module, fields) if fields else module
+
+
+def _with_fields(module: Any, fields: dict[str, Any]) -> Any:
+    """A copy of a module with other values of some fields, past its converters and checks."""
+    made = copy.copy(module)
+    vars(made).update(fields)
+    return made
 
 
 class _Once:

@@ -37,6 +37,7 @@ class SerialArm(AbstractArm):
       are left out.
     """
 
+    constants = ("chain", "bodies", "combined")
     chain: Chain = eqx.field(metadata=KNOWN)
     bodies: Float[Array, "joints 10"] = eqx.field(converter=as_float64)
     lower: tuple[float, ...] = eqx.field(static=True)
@@ -120,12 +121,12 @@ class SerialArm(AbstractArm):
         They give the torque of these base parameters; combinations on which torque does not depend
         are as in `bodies`.
         """
-        drawn = jnp.ravel(self.bodies)
+        drawn = self.bodies.reshape(-1)
         changed = self.base - self.combined @ drawn
-        # Piece by piece: an indexed update would break up the kernel of a simulation's loop.
+        # Number by number: an array operation would break up the kernel of a simulation's loop.
         place = {leading: k for k, leading in enumerate(self.leading)}
-        pieces = [changed[place[k]] if k in place else jnp.zeros(()) for k in range(drawn.size)]
-        return (drawn + jnp.stack(pieces)).reshape(self.bodies.shape)
+        numbers = [x + changed[place[k]] if k in place else x for k, x in enumerate(drawn)]
+        return jnp.stack(numbers).reshape(self.bodies.shape)
 
     def combinations(self) -> dict[str, str]:
         """Each base parameter as a sum of link parameters."""

@@ -44,7 +44,8 @@ def unrolled(fun: Callable[..., Any], *like: Any) -> Callable[..., Any]:
     of a loop's kernel.
 
     Values equal those of `fun` under `jax.jit`, including signed zeros, infinities and NaN, up to
-    rounding (sums may be added in another order) and the sign of sums that contain only zeros.
+    rounding (sums may be added in another order) and the sign of sums that contain only zeros. A
+    product with a zero of a constant array is that zero, whatever the other factor.
 
     **Arguments:**
 
@@ -53,7 +54,7 @@ def unrolled(fun: Callable[..., Any], *like: Any) -> Callable[..., Any]:
     """
     closed, shape = jax.make_jaxpr(fun, return_shape=True)(*like)
     structure = jax.tree.structure(shape)
-    consts = [_Value.of(c) for c in closed.consts]
+    consts = [_Value.constant(c) for c in closed.consts]
     for const in consts:
         # Done here, because the first use may be inside a loop.
         const.scalars() if const.small else const.whole()
@@ -101,6 +102,16 @@ class _Value:
         return self._scalars
 
     @classmethod
+    def constant(cls, array) -> "_Value":
+        """Of an array that the function refers to; its numbers are `_Fixed` if they are known."""
+        value = cls.of(array)
+        if isinstance(value._array, np.ndarray) and value.dtype == float and value.small:
+            value._scalars = np.empty(value.shape, object)
+            for at in np.ndindex(value.shape):
+                value._scalars[at] = _Fixed(value._array[at])
+        return value
+
+    @classmethod
     def like(cls, aval) -> "_Value":
         return cls(aval.shape, aval.dtype)
 
@@ -113,6 +124,10 @@ class _Value:
         return self.small or self._scalars is not None
 
 
+class _Fixed(np.float64):
+    """A number that follows from constant arrays alone, such as the frames of an arm."""
+
+
 def _known(x) -> bool:
     return isinstance(x, np.generic)
 
@@ -120,10 +135,17 @@ def _known(x) -> bool:
 def _same(name: str, args: list[Any]):
     """The operand that an operation returns unchanged; None if it changes its operands.
 
-    −0 + 0 is 0 by IEEE 754, but XLA also omits the addition of a known zero of either sign.
+    −0 + 0 is 0 by IEEE 754, but XLA also omits the addition of a known zero of either sign. Frames
+    and axes of most arms are mostly zeros, with which products are omitted too.
     """
+    if name == "select_n" and _known(args[0]):
+        return args[1 + int(args[0])]
     if len(args) != 2:
         return None
+    if name == "mul":
+        zero = next((x for x in args if isinstance(x, _Fixed) and x == 0), None)
+        if zero is not None:
+            return zero
     for a, known in (args, args[::-1]):
         neutral = {"add": 0, "mul": 1, "sub": 0 if known is args[1] else None}.get(name)
         if neutral is not None and _known(known) and known == neutral:
@@ -260,7 +282,9 @@ class _Writer:
         if all(_known(a) for a in args):
             if name in ARITHMETIC:
                 with np.errstate(all="ignore"):
-                    return ARITHMETIC[name](*args)
+                    found = ARITHMETIC[name](*args)
+                fixed = any(isinstance(a, _Fixed) for a in args) and found.dtype == float
+                return _Fixed(found) if fixed else found
             # XLA decides how numbers outside an integer type's range are converted.
             if name == "convert_element_type" and not (
                 args[0].dtype.kind == "f" and np.dtype(params["new_dtype"]).kind in "iu"
@@ -341,21 +365,32 @@ class _Writer:
         return out
 
     def scattered(self, name, p, operand: _Value, indices: _Value, updates: _Value):
-        """One element set, added to or multiplied, at a place known when the program is made."""
-        numbers, rank = p["dimension_numbers"], len(operand.shape)
-        at = indices.scalars()
-        one = tuple(numbers.inserted_window_dims) == tuple(range(rank)) and at.shape == (rank,)
-        if not one or updates.shape or not all(_known(i) for i in at):
+        """Elements set, added to or multiplied: one, or all with one index along an axis.
+
+        Indices must be known when the program is made.
+        """
+        numbers, at = p["dimension_numbers"], indices.scalars()
+        indexed = tuple(numbers.inserted_window_dims)
+        whole = [d for d in range(len(operand.shape)) if d not in indexed]
+        plain = not (numbers.operand_batching_dims or numbers.scatter_indices_batching_dims)
+        fits = at.shape == (len(indexed),) and updates.shape == tuple(
+            operand.shape[d] for d in whole
+        )
+        if not plain or not fits or not all(_known(i) for i in at):
             return None
-        place = tuple(int(at[numbers.scatter_dims_to_operand_dims.index(d)]) for d in range(rank))
-        if any(not 0 <= i < n for i, n in zip(place, operand.shape, strict=True)):
+        if tuple(numbers.update_window_dims) != tuple(range(len(whole))):
             return None
-        out, update = operand.scalars().copy(), updates.scalars()[()]
-        if name == "scatter-add":
-            update = self.plus(out[place], update)
-        elif name == "scatter-mul":
-            update = self.times(out[place], update)
-        out[place] = update
+        order = [numbers.scatter_dims_to_operand_dims.index(d) for d in indexed]
+        index = {d: int(at[k]) for d, k in zip(indexed, order, strict=True)}
+        if any(not 0 <= i < operand.shape[d] for d, i in index.items()):
+            return None
+        combine = {"scatter-add": self.plus, "scatter-mul": self.times}.get(name)
+        out, given = operand.scalars().copy(), updates.scalars()
+        for k in np.ndindex(given.shape):
+            # The rest of the place, in the order of the axes.
+            rest = iter(k)
+            to = tuple(index[d] if d in index else next(rest) for d in range(out.ndim))
+            out[to] = given[k] if combine is None else combine(out[to], given[k])
         return out
 
 
