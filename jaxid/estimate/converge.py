@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..control import OpenLoop
 from ..noise import ARFilter, Noise, VectorAR
@@ -18,7 +18,7 @@ from ..simulation.batch import Batch, prepare
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate_batch
 from ..simulation.sharing import taken
-from ..simulation.steps import refined, set_substeps
+from ..simulation.steps import MANY, refined, set_substeps, sharpest
 from .covariance import Optimum
 from .minimise import Minimum, Point, Problem, Stopping, minimise, reweighted
 from .pieces import (
@@ -80,7 +80,7 @@ def converge(
             np.concatenate([batch.q0, batch.v0], axis=1),
         )
     )
-    bounds = Bounds.of(loop.free_parameters)
+    bounds = _resolved(loop, recordings)
     if weights is None and filters is not None:
         weights = _weights_of(filters, first)
     # For a single output the weight only scales the loss.
@@ -133,6 +133,21 @@ def converge(
         signals=signals,
         iterations=total,
     )
+
+
+def _resolved(loop: ClosedLoop, recordings: Recordings) -> Bounds:
+    """The parameters' bounds, with smoothings of signs no smaller than the steps resolve."""
+    bounds, factor = Bounds.of(loop.free_parameters), sharpest(loop, recordings)
+    if not factor:
+        return bounds
+    least = np.where(_smoothings(loop), factor * np.asarray(loop.theta), -np.inf)
+    return dataclasses.replace(bounds, lower=jax.device_put(np.maximum(bounds.lower, least)))
+
+
+def _smoothings(loop: ClosedLoop) -> Bool[np.ndarray, " parameters"]:
+    """Which free parameters are smoothings of a sign."""
+    free = loop.free_parameters
+    return np.array([p.place[-1] == "smoothing" for p in free for _ in range(p.size)], bool)
 
 
 def _weights_of(filters: Noise, first: Float[Array, " outputs"]) -> Float[Array, " outputs"]:
@@ -190,6 +205,9 @@ def finer_substeps(done: Converged) -> int | None:
     if isinstance(done.loop.controller, OpenLoop):
         return None
     now, batch = done.loop.stepping.substeps or 1, done.batch
+    if _at_its_sharpest(done):
+        # A sign that changes at once has no step that is small enough.
+        return 4 * now if 4 * now <= MANY else None
     # Few recordings use the program that is already compiled; of many recordings, one is enough.
     if len(done.pieces) > 4:
         shortest = int(np.argmin([piece.samples for piece in done.pieces]))
@@ -205,6 +223,15 @@ def finer_substeps(done: Converged) -> int | None:
     # A method of order p leaves 2⁻ᵖ of its error at half the step.
     power = 1.2 / (done.loop.stepping.solver.order(None) or 1)
     return refined(now * (error.max() / 1e-4) ** power + 1, done.loop.name)
+
+
+def _at_its_sharpest(done: Converged) -> bool:
+    """Whether a smoothing of a sign is at the smallest value that the steps resolve."""
+    signs = _smoothings(done.loop)
+    declared = np.asarray(Bounds.of(done.loop.free_parameters).lower)[signs]
+    lower = np.asarray(done.problem.lower)[: len(signs)][signs]
+    theta = np.asarray(done.loop.theta)[signs]
+    return bool(np.any((lower > declared) & (theta <= 1.01 * lower)))
 
 
 def from_best_starts(

@@ -95,13 +95,18 @@ class OEM(AbstractMethod):
                 kept = _without_diverging(done.loop, recordings)
             if len(kept) < len(recordings):
                 done = self._from_start(loop, kept, say, deadline)
-            finer = finer_substeps(done)
-            if finer is not None and time.perf_counter() < deadline:
+            for _ in range(_REFINED):
+                finer = finer_substeps(done)
+                if finer is None or time.perf_counter() > deadline:
+                    break
                 say(f"again with {finer} steps between samples")
                 finer_loop = set_substeps(done.loop, finer, settled=True)
-                done = converge(
+                again = converge(
                     self, finer_loop, kept, say, deadline=deadline, weights=done.weights
                 )
+                if not again.minimum.status.simulated:
+                    break
+                done = again
         seconds = time.perf_counter() - started
         found = report(self.deviations, done, kept, seconds, self)
         more = (*_left_out(recordings, kept), *self._forgotten(loop))
@@ -132,6 +137,10 @@ class OEM(AbstractMethod):
         loop = start_values(loop, recordings, self.start, say, whole)
         loop = with_substeps(loop, recordings)
         return converge(self, loop, recordings, say, deadline=deadline, batch=batch)
+
+
+# How often the number of steps is raised after a fit.
+_REFINED = 3
 
 
 def _without_diverging(loop: ClosedLoop, recordings: Recordings) -> Recordings:

@@ -163,6 +163,40 @@ def fastest_rate(loop: ClosedLoop, recordings: Recordings) -> float:
     return _rates(loop, recordings)[0]
 
 
+# Step times fastest rate at which explicit methods are still stable; 2.78 for RK4.
+_STABLE = 2.5
+# By how much smoothings are reduced at a time, and how often at most.
+_SHARPER, _TIMES = 1.5, 30
+
+
+def sharpest(loop: ClosedLoop, recordings: Recordings) -> float:
+    """Factor down to which the loop's estimated smoothings of a sign may be reduced.
+
+    With sharper signs, the loop's fixed steps would not be stable at standstill. Zero if there is
+    no such limit.
+
+    **Arguments:**
+
+    - `loop`: with its number of steps set.
+    """
+    signs = [p for p in loop.free_parameters if p.place[-1] == "smoothing"]
+    stepping = loop.stepping
+    implicit = isinstance(stepping.solver, diffrax.AbstractImplicitSolver)
+    if not signs or given(loop) or implicit or stepping.control is not None:
+        return 0.0
+    period = loop.controller.period
+    longest = max(r.period for r in recordings)
+    step = (longest if period is None else min(longest, period)) / (stepping.substeps or 1)
+    factor = 1.0
+    for _ in range(_TIMES):
+        sharper = factor / _SHARPER
+        values = {p.name: sharper * p.where(loop) for p in signs}
+        if fastest_rate(loop.with_values(**values), recordings) * step > _STABLE:
+            break
+        factor = sharper
+    return factor
+
+
 def _rates(loop: ClosedLoop, recordings: Recordings) -> tuple[float, float]:
     """Largest eigenvalues at standstill, and at the highest speed over ten samples, 1/s."""
     few = [np.arange(0, r.samples, max(1, r.samples // 8)) for r in recordings]
