@@ -24,7 +24,7 @@ Examples:
 \b
 Exit codes:
   0    it is done, whatever the verdict but one
-  1    a fit that did not converge; its result is printed and written all the same
+  1    a fit that did not converge or does not describe the recordings; its result is written too
   2    something given cannot be used; the one line on stderr says what to do
   3    a discovery whose verdict is undetermined; its result is printed and written all the same
   130  interrupted by Ctrl-C

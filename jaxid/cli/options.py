@@ -35,12 +35,14 @@ Log = Annotated[
         "--log", help="Columns, units, scales in a TOML file, as of jaxid inspect --write."
     ),
 ]
+# None where nothing is said: then the file of --log decides.
 Gaps = Annotated[
-    Literal["refuse", "allow"], typer.Option(help="Missing stretches of time in a recording.")
+    Literal["refuse", "allow"] | None,
+    typer.Option(help="Missing stretches of time in a recording; refused by default."),
 ]
 Clock = Annotated[
-    Literal["recorded", "even"],
-    typer.Option(help="Times as recorded, or even where those of a logger jitter."),
+    Literal["recorded", "even"] | None,
+    typer.Option(help="Times as recorded, by default, or even where those of a logger jitter."),
 ]
 DropNan = Annotated[
     bool, typer.Option("--drop-nan", help="Leave out samples at which a signal is empty.")
