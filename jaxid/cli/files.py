@@ -41,11 +41,18 @@ class ReadOptions(eqx.Module):
     def __call__(self, files: Sequence[Path]) -> Any:
         """The recordings in files.
 
-        **Raises:** `RecordingError` or `ModelError` for what cannot be read, or is there twice.
+        **Raises:** `RecordingError` or `ModelError` for what cannot be read.
         """
         from ..recording import read
 
-        recordings = read(*files, **self.told())
+        return read(*files, **self.told())
+
+    def fitted(self, files: Sequence[Path]) -> Any:
+        """The recordings in files that are to be fitted.
+
+        **Raises:** `RecordingError` or `ModelError` for what cannot be read, or is there twice.
+        """
+        recordings = self(files)
         for one, other in itertools.combinations(recordings, 2):
             if np.array_equal(one.q, other.q) and np.array_equal(one.tau, other.tau):
                 raise RecordingError(

@@ -75,7 +75,7 @@ def fit(
             raise ModelError(f"--method {method} simulates nothing in windows: leave out --window")
         loop = with_controller(load_robot(robot), controller)
         reading = ReadOptions(column, unit, log, gaps, clock, drop_nan)
-        found = estimate.fit(loop, reading(files), methods[method]())
+        found = estimate.fit(loop, reading.fitted(files), methods[method]())
         typer.echo(repr(found).partition("\n")[0] if quiet else repr(found))
         write_json(json_file, found.to_dict())
         if not found.succeeded or estimate.doubtful_joints(found):

@@ -158,7 +158,7 @@ def diagnose(
         loop = with_controller(load_robot(robot), controller)
         own = [load_effect(given) for given in catalogue or ()]
         reading = ReadOptions(column, unit, log, gaps, clock, drop_nan)
-        fitted = fit(loop, reading(files), OEM(progress=not quiet))
+        fitted = fit(loop, reading.fitted(files), OEM(progress=not quiet))
         found = run_diagnose(fitted, catalogue=(*known, *own), progress=not quiet)
         typer.echo(repr(found).partition("\n")[0] if quiet else f"{fitted!r}\n\n{found!r}")
         write_json(json_file, {"fit": fitted.to_dict(), **found.to_dict()})
