@@ -310,7 +310,12 @@ def test_a_fleet_has_one_table_however_it_is_run(tmp_path):
     ways = [row for row in rows if row["about"] == "ways"]
     assert len(ways) == 3
     for row in ways:
-        assert row["same"] is True or row["note"] == "distributed is not installed", row
+        if row["note"] == "distributed is not installed":
+            continue
+        assert row["same"], row
+        # Where the search ends depends on rounding by as much as a fit's tolerance of 1e-2
+        # deviations, which changes the error it leaves by the square of that.
+        assert row["numbers_apart"] < 1e-4, row
 
 
 @pytest.mark.slow
