@@ -89,7 +89,7 @@ def inspect(
         write_json(json_file, inspected.to_dict())
         if write is not None:
             told = reading.told()
-            if not inspected.signals["gaps"].any():
+            if not inspected.signals["gaps"].to_numpy().any():
                 told["gaps"] = "refuse"
             text = description(told, found, recordings.joints)
             write.write_text(text, encoding="utf-8")

@@ -66,7 +66,7 @@ def pack(value: Any) -> bytes:
         "objects": packer.objects,
         "arrays": [digest for digest, _ in packer.arrays],
     }
-    text = json.dumps(manifest, indent=1, allow_nan=False).encode()
+    text = json.dumps(manifest, separators=(",", ":"), allow_nan=False).encode()
     members = {"manifest.json": text, "manifest.sha256": _digest(text).encode()}
     members |= {f"{k}.npy": content for k, (_, content) in enumerate(packer.arrays)}
     buffer = io.BytesIO()
