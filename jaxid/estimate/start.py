@@ -65,7 +65,7 @@ def _by_didim(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " l
 
 # Share of the squared torque, mean over joints, below which no better start is needed.
 _NEAR = 0.2**2
-# Steps of a start over those of the loop as it is, above which an inertia is next to nothing: of
+# Steps of a start over those of the loop as it is, above which an inertia is almost zero: of
 # recordings with a mistake in them, whose fit would take an hour for each of its steps.
 _STIFFER = 10
 
