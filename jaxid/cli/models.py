@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import ModelError
+from ..errors import ModelError, SaveError
 
 
 def load_robot(robot: str | None) -> Any:
@@ -155,7 +155,15 @@ def saved_model(robot: str | None, path: Path | None, own: frozenset[type] = fro
         from ..storage.saved import load
 
         theirs = frozenset() if robot is None else classes_of(load_robot(robot))
-        saved = load(path, theirs | own)
+        try:
+            saved = load(path, theirs | own)
+        except SaveError as error:
+            if robot is None and "of your class" in str(error):
+                raise ModelError(
+                    f"{path} holds classes of your own: name their file as well, --robot "
+                    "FILE.py:NAME, and --catalogue FILE.py:NAME for an effect"
+                ) from error
+            raise
         if not hasattr(saved, "loop"):
             raise ModelError(f"{path} holds no model: give a saved fit or story")
         return saved.loop
