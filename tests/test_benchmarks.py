@@ -299,6 +299,26 @@ def test_load_is_what_moves_the_link_and_library_names_what_it_is_given():
 
 
 @pytest.mark.slow
+def test_a_fleet_has_one_table_however_it_is_run(tmp_path):
+    """In processes, by Dask where it is installed, and killed and resumed; one robot is broken."""
+    rows = _quick("fleet", tmp_path)
+    robots = {row["robot"]: row for row in rows if row["about"] == "robots"}
+    verdicts = {name: row["verdict"] for name, row in robots.items()}
+    assert verdicts["robot 00"] == verdicts["robot 03"] == "adequate"
+    assert (verdicts["robot 01"], verdicts["robot 02"]) == ("failed", "explained")
+    assert robots["robot 02"]["effects"] == "spring(1)"
+    ways = [row for row in rows if row["about"] == "ways"]
+    assert len(ways) == 3
+    for row in ways:
+        if row["note"] == "distributed is not installed":
+            continue
+        assert row["same"], row
+        # Where the search ends depends on rounding by as much as a fit's tolerance of 1e-2
+        # deviations, which changes the error it leaves by the square of that.
+        assert row["numbers_apart"] < 1e-4, row
+
+
+@pytest.mark.slow
 @pytest.mark.shared
 def test_a_measured_servo_is_simulated_from_its_first_sample(tmp_path, shared_data):
     """The errors that the recordings' own README gives, fitted on that same error, in mrad."""

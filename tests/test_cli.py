@@ -146,6 +146,8 @@ def test_a_fit_that_failed_ends_with_one(monkeypatch, tmp_path):
         (["fit", FIT_1, *SCARA, "--unit", "q=parsec"], "is not a unit known for q"),
         (["fit", FIT_1, *SCARA, "--window", "0.01"], "make it longer"),
         (["compare", FIT_1, *SCARA, "--fit", FIT_1], "contains no fitted parameters"),
+        (["compare", FIT_1, *SCARA, "--fit", "absent.json"], "there is no file absent.json"),
+        (["fit", FIT_1, FIT_1, *SCARA], "name each recording once"),
     ],
 )
 def test_a_users_error_is_one_sentence(arguments, says, tmp_path, monkeypatch):
@@ -158,16 +160,31 @@ def test_a_users_error_is_one_sentence(arguments, says, tmp_path, monkeypatch):
     assert len(result.stderr.splitlines()) == 1
 
 
+def test_values_of_another_robot_are_refused(tmp_path):
+    file = tmp_path / "fit.json"
+    file.write_text(json.dumps({"parameters": {"stiffness": {"value": 1.0}}}))
+    result = run("compare", FIT_1, *SCARA, "--fit", file)
+    assert result.exit_code == 2
+    assert "has stiffness, which" in result.stderr
+    assert "it is of another robot" in result.stderr
+
+
 def test_what_is_wrong_with_ones_own_robot_is_said(tmp_path):
     file = tmp_path / "my_robot.py"
     file.write_text(OWN_ROBOT)
     for name in ("wrong", "absent"):
         with pytest.raises(ModelError, match="has no ClosedLoop called"):
             load_robot(f"{file}:{name}")
+    with pytest.raises(ModelError, match=f"without its loop: give --robot {file}:loop"):
+        load_robot(str(file))
     broken = tmp_path / "broken.py"
-    broken.write_text("import nothing_of_that_name\n")
-    with pytest.raises(ModelError, match="cannot be imported"):
-        load_robot(f"{broken}:loop")
+    for text, says in (
+        ("import jaxid\nimport nothing_of_that_name\n", "line 2: ModuleNotFoundError: No module"),
+        ("loop = (\n", "line 1: '.' was never closed"),
+    ):
+        broken.write_text(text)
+        with pytest.raises(ModelError, match=rf"fails when it is imported \({says}"):
+            load_robot(f"{broken}:loop")
     file.write_text(OWN_ROBOT + "\n\ndef asks(more):\n    return loop\n")
     with pytest.raises(ModelError, match=r"asks\(\) in .* give a function without arguments"):
         load_robot(f"{file}:asks")

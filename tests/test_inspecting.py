@@ -196,6 +196,20 @@ def test_a_description_that_says_something_else_is_refused(tmp_path):
         assert len(refused.stderr.splitlines()) == 1
 
 
+def test_an_option_goes_before_the_description_which_allows_no_gap_that_is_not_there(tmp_path):
+    def cut(table):
+        return table.drop(range(100, 200))
+
+    path, toml = log(tmp_path / "run.csv", cut), tmp_path / "log.toml"
+    assert run("inspect", path, "--write", toml).exit_code == 0
+    assert 'gaps = "allow"' in toml.read_text(encoding="utf-8")
+    refused = run("fit", path, "--robot", "scara", "--log", toml, "--gaps", "refuse")
+    assert refused.exit_code == 2
+    assert "has a gap of" in refused.stderr
+    assert run("inspect", FIT_1, "--write", toml).exit_code == 0
+    assert 'gaps = "refuse"' in toml.read_text(encoding="utf-8")
+
+
 def test_blank_cells_are_refused_by_line_and_left_out_if_told(tmp_path):
     def blank(table):
         table.loc[[40, 41, 300], "pos2"] = np.nan

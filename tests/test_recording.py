@@ -203,6 +203,20 @@ def test_a_plain_v1_is_no_velocity() -> None:
     assert Recording.from_dataframe(table).v is None
 
 
+@pytest.mark.parametrize(
+    ("jump", "says"), [(0.5, "jumps by 0.5.* at row 201, where"), (2 * np.pi, "is a turn: unwrap")]
+)
+def test_a_jump_of_a_position_is_named_with_its_place(jump, says):
+    time = 0.005 * np.arange(400)
+    q = np.sin(time)
+    if jump < 1:
+        q[200] += jump
+    else:
+        q[200:] -= jump
+    with pytest.warns(JaxidWarning, match=says):
+        Recording.from_arrays(time, q, np.cos(time))
+
+
 def test_uneven_sampling_is_no_gap() -> None:
     time = np.cumsum(np.random.default_rng(0).exponential(0.01, SAMPLES))
     Recording.from_arrays(**signals() | {"time": time})

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -251,6 +252,21 @@ def test_friction_in_a_gear_is_of_both_of_its_sides():
     assert at(0.5, -0.8, 0.2) == pytest.approx(abs(0.2 * 0.5 - 0.1 * 0.8) + slow, rel=1e-6)
     # It is there though the drive gives nothing.
     assert at(0.0, 0.8, -9.0) == pytest.approx(-0.1 * 0.8, rel=1e-6)
+
+
+def test_friction_in_a_gear_has_a_slope_at_nothing():
+    """A search looks for an effect by its slope at zero, where that of |Km tau| is zero."""
+    one, tau, load = jnp.ones(1), 0.5, 0.8
+    motion = Motion(jnp.zeros(()), one, 9.0 * one, one, tau * one, jnp.zeros(0), jnp.asarray(0))
+    motion = dataclasses.replace(motion, load=load * one)
+
+    def torque(drive, back):
+        gear = GearFriction(joint=1, drive=drive, back=back, smoothing=1e-9)
+        return gear.torque(motion)[0]
+
+    assert jax.grad(lambda x: torque(x, None))(0.0) == pytest.approx(tau + load, rel=1e-6)
+    both = jax.grad(torque, (0, 1))(0.0, 0.0)
+    assert both == pytest.approx((tau, load), rel=1e-6)
 
 
 def test_a_gear_sees_the_load_of_the_links():

@@ -19,6 +19,7 @@ from jaxid.effects import (
     ActuatorLag,
     Backlash,
     EncoderEccentricity,
+    GearFriction,
     Gravity,
     JointElasticity,
     LoadDependentFriction,
@@ -111,6 +112,20 @@ def test_finite_effects_that_share_a_program_are_as_in_simulations_of_their_own(
         # Contact is stiff: what rounding does to its first touch grows.
         with_it = plain + change[0, : record.samples]
         np.testing.assert_allclose(with_it, alone, atol=1e-6 * largest.max(), err_msg=str(effect))
+
+
+def test_an_effect_that_leaves_the_motion_given_is_held_against_the_given_run(record):
+    """Under an unknown law friction in a gear needs no feedback, and a torque limit does."""
+    loop = jaxid.scara(jaxid.control.Tracking())
+    batch = prepare(loop, jaxid.Recordings.of(record))
+    plain = jaxid.simulate(loop, record)[0].tau
+    effects = [TorqueSaturation(1, 1e9), GearFriction(joint=1, drive=0.1)]
+    limit, gear = differences(loop, batch, effects, 0, jnp.asarray(plain)[None])
+    alone = jaxid.simulate(loop.add(effects[1]), record)[0].tau
+    np.testing.assert_allclose(plain + gear[0], alone, atol=1e-12 * np.abs(alone).max())
+    assert np.abs(gear).max() > 0.01 * np.abs(plain).max()
+    # A limit that is never reached changes nothing, whatever feedback errs by.
+    np.testing.assert_allclose(limit, 0.0, atol=1e-9 * np.abs(plain).max())
 
 
 class Creep(AbstractEffect):

@@ -24,7 +24,8 @@ Examples:
 \b
 Exit codes:
   0    success
-  1    a fit did not converge, or a robot of discover-all failed; the results are still written
+  1    a fit did not converge or does not describe the recordings, or a robot of discover-all
+       failed; the results are still written
   2    an input cannot be used; one line on stderr explains what to do
   3    the verdict of a discovery is undetermined; its result is still printed and written
   130  interrupted by Ctrl-C

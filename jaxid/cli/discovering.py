@@ -101,8 +101,8 @@ def discover(
     column: Column = None,
     unit: Unit = None,
     log: Log = None,
-    gaps: Gaps = "refuse",
-    clock: Clock = "recorded",
+    gaps: Gaps = None,
+    clock: Clock = None,
     drop_nan: DropNan = False,
     controller: Controller = None,
     quiet: Quiet = False,
@@ -135,7 +135,7 @@ def discover(
         _check_apart(files, held_out)
         story = run_discover(
             loop,
-            reading(files),
+            reading.fitted(files),
             validate=reading(held_out) if held_out else None,
             catalogue=(*without(known, exclude or ()), *own),
             worth=worth,

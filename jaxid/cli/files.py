@@ -1,5 +1,6 @@
 """Recordings that commands read, and results that they write."""
 
+import itertools
 import json
 import math
 import tomllib
@@ -8,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 
-from ..errors import ModelError, near
+from ..errors import ModelError, RecordingError, near
 
 
 class ReadOptions(eqx.Module):
@@ -18,8 +20,8 @@ class ReadOptions(eqx.Module):
     column: list[str] | None = None
     unit: list[str] | None = None
     log: Path | None = None
-    gaps: str = "refuse"
-    clock: str = "recorded"
+    gaps: str | None = None
+    clock: str | None = None
     drop_nan: bool = False
 
     def told(self) -> dict[str, Any]:
@@ -30,10 +32,8 @@ class ReadOptions(eqx.Module):
         told = {} if self.log is None else described(self.log)
         told["columns"] = told.get("columns", {}) | _several(_pairs(self.column, "column"))
         told["units"] = told.get("units", {}) | _several(_pairs(self.unit, "unit"))
-        if self.gaps != "refuse":
-            told["gaps"] = self.gaps
-        if self.clock != "recorded":
-            told["clock"] = self.clock
+        told |= {} if self.gaps is None else {"gaps": self.gaps}
+        told |= {} if self.clock is None else {"clock": self.clock}
         if self.drop_nan:
             told["nan"] = "drop"
         return {key: value for key, value in told.items() if value != {}}
@@ -46,6 +46,20 @@ class ReadOptions(eqx.Module):
         from ..recording import read
 
         return read(*files, **self.told())
+
+    def fitted(self, files: Sequence[Path]) -> Any:
+        """The recordings in files that are to be fitted.
+
+        **Raises:** `RecordingError` or `ModelError` for what cannot be read, or is there twice.
+        """
+        recordings = self(files)
+        for one, other in itertools.combinations(recordings, 2):
+            if np.array_equal(one.q, other.q) and np.array_equal(one.tau, other.tau):
+                raise RecordingError(
+                    f"{one.name} and {other.name} have the same samples: name each recording "
+                    "once, since a copy makes deviations too small"
+                )
+        return recordings
 
 
 def described(path: Path) -> dict[str, Any]:

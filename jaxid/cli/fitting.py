@@ -34,8 +34,8 @@ def fit(
     column: Column = None,
     unit: Unit = None,
     log: Log = None,
-    gaps: Gaps = "refuse",
-    clock: Clock = "recorded",
+    gaps: Gaps = None,
+    clock: Clock = None,
     drop_nan: DropNan = False,
     controller: Controller = None,
     method: Annotated[str, typer.Option(help=METHODS)] = "oem",
@@ -50,7 +50,8 @@ def fit(
       jaxid fit run.mat --robot emps --method idim
       jaxid fit run.csv --robot my_robot.py:loop --column q=pos_a,pos_b --unit q=deg
 
-    The exit code is 0, 1 if the fit did not converge, 2 if an input cannot be used.
+    The exit code is 0; 1 if the fit did not converge or leaves more than 30 % of a joint; 2 if an
+    input cannot be used.
     """
     from .. import estimate
 
@@ -74,10 +75,10 @@ def fit(
             raise ModelError(f"--method {method} does not simulate windows: leave out --window")
         loop = with_controller(load_robot(robot), controller)
         reading = ReadOptions(column, unit, log, gaps, clock, drop_nan)
-        found = estimate.fit(loop, reading(files), methods[method]())
+        found = estimate.fit(loop, reading.fitted(files), methods[method]())
         typer.echo(repr(found).partition("\n")[0] if quiet else repr(found))
         write_json(json_file, found.to_dict())
-        if not found.succeeded:
+        if not found.succeeded or estimate.doubtful_joints(found):
             raise typer.Exit(1)
 
 
@@ -88,8 +89,8 @@ def compare(
     column: Column = None,
     unit: Unit = None,
     log: Log = None,
-    gaps: Gaps = "refuse",
-    clock: Clock = "recorded",
+    gaps: Gaps = None,
+    clock: Clock = None,
     drop_nan: DropNan = False,
     controller: Controller = None,
     values: Annotated[

@@ -109,4 +109,4 @@ def _given(row: dict[str, str], folder: Path, controller: str | None) -> tuple[A
         [folder / name for name in row.get(kind, "").split()] for kind in ("fit", "validate")
     )
     loop = with_controller(load_robot(robot), controller)
-    return loop, reading(fitted), reading(unseen) if unseen else None
+    return loop, reading.fitted(fitted), reading(unseen) if unseen else None

@@ -33,8 +33,8 @@ def inspect(
     column: Column = None,
     unit: Unit = None,
     log: Log = None,
-    gaps: Gaps = "allow",
-    clock: Clock = "recorded",
+    gaps: Gaps = None,
+    clock: Clock = None,
     drop_nan: DropNan = False,
     write: Annotated[
         Path | None,
@@ -62,6 +62,8 @@ def inspect(
 
     with sentences():
         check_outputs(json_file, write, plot)
+        # What is to be looked at is read with its gaps, unless that is refused.
+        gaps = gaps or "allow"
         reading = ReadOptions(column, unit, log, gaps, clock, drop_nan)
         found = contents_of(files[0], **_named(reading))
         for line in found.about or (", ".join(found.columns),):
@@ -86,7 +88,10 @@ def inspect(
             typer.echo(remark)
         write_json(json_file, inspected.to_dict())
         if write is not None:
-            text = description(reading.told(), found, recordings.joints)
+            told = reading.told()
+            if not inspected.signals["gaps"].to_numpy().any():
+                told["gaps"] = "refuse"
+            text = description(told, found, recordings.joints)
             write.write_text(text, encoding="utf-8")
             typer.echo(f"{write} describes these files: check it, then use --log {write}")
         if plot is not None:
@@ -130,8 +135,8 @@ def diagnose(
     column: Column = None,
     unit: Unit = None,
     log: Log = None,
-    gaps: Gaps = "refuse",
-    clock: Clock = "recorded",
+    gaps: Gaps = None,
+    clock: Clock = None,
     drop_nan: DropNan = False,
     controller: Controller = None,
     quiet: Quiet = False,
@@ -153,7 +158,7 @@ def diagnose(
         loop = with_controller(load_robot(robot), controller)
         own = [load_effect(given) for given in catalogue or ()]
         reading = ReadOptions(column, unit, log, gaps, clock, drop_nan)
-        fitted = fit(loop, reading(files), OEM(progress=not quiet))
+        fitted = fit(loop, reading.fitted(files), OEM(progress=not quiet))
         found = run_diagnose(fitted, catalogue=(*known, *own), progress=not quiet)
         typer.echo(repr(found).partition("\n")[0] if quiet else f"{fitted!r}\n\n{found!r}")
         write_json(json_file, {"fit": fitted.to_dict(), **found.to_dict()})

@@ -3,11 +3,12 @@
 import importlib.util
 import json
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import ModelError
+from ..errors import ModelError, SaveError
 
 
 def load_robot(robot: str | None) -> Any:
@@ -34,22 +35,49 @@ def load_robot(robot: str | None) -> Any:
     if robot.lower().endswith(".urdf"):
         return robots.serial(robot)
     path, _, name = robot.rpartition(":")
+    if robot.endswith(".py"):
+        names = _named(_module(robot), ClosedLoop) or "NAME"
+        raise ModelError(f"{robot} is named without its loop: give --robot {robot}:{names}")
     if not path.endswith(".py"):
         raise ModelError(
             f"there is no robot {robot!r}: choose {', '.join(ready)}, or give FILE.urdf or "
             "FILE.py:NAME"
         )
-    made = getattr(_module(path), name, None)
+    module = _module(path)
+    made = getattr(module, name, None)
     try:
         made = made() if callable(made) and not isinstance(made, ClosedLoop) else made
     except Exception as error:
         raise ModelError(
-            f"{name}() in {path} fails ({error!r}): give a function without arguments that "
-            "returns a ClosedLoop"
+            f"{name}() in {path} fails ({_where(path, error)}): give a function without arguments "
+            "that returns a ClosedLoop"
         ) from error
     if not isinstance(made, ClosedLoop):
-        raise ModelError(f"{path} has no ClosedLoop called {name!r}: name the one it defines")
+        raise ModelError(
+            f"{path} has no ClosedLoop called {name!r}: name one that it defines, "
+            f"{_named(module, ClosedLoop) or 'of which it has none'}"
+        )
     return made
+
+
+def _named(module: Any, kind: type) -> str:
+    """The names that a module has for objects of a kind."""
+    return " or ".join(name for name, value in vars(module).items() if isinstance(value, kind))
+
+
+def _where(path: str, error: BaseException) -> str:
+    """The line of a file from which an error came, and what it says."""
+    if isinstance(error, SyntaxError):
+        return f"line {error.lineno}: {error.msg}"
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if _same(frame.filename, path)]
+    at = f"line {lines[-1]}: " if lines else ""
+    return f"{at}{type(error).__name__}: {error}"
+
+
+def _same(one: str | None, other: str) -> bool:
+    """Whether two paths name one file."""
+    return one is not None and Path(one).resolve() == Path(other).resolve()
 
 
 def load_effect(given: str) -> Any:
@@ -77,7 +105,7 @@ def _module(path: str) -> Any:
     if not Path(path).is_file():
         raise ModelError(f"there is no file {path}: give the path of your own Python file")
     known, stamp = sys.modules.get(Path(path).stem), Path(path).stat().st_mtime_ns
-    mine = known is not None and getattr(known, "__file__", None) == path
+    mine = _same(getattr(known, "__file__", None), path)
     # A file that is loaded again must give the same classes, unless it has changed in between.
     if mine and getattr(known, "_read_at", None) == stamp:
         return known
@@ -93,7 +121,9 @@ def _module(path: str) -> Any:
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise ModelError(f"{path} cannot be imported ({error!r}): correct it first") from error
+        raise ModelError(
+            f"{path} fails when it is imported ({_where(path, error)}): correct it first"
+        ) from error
     return module
 
 
@@ -127,7 +157,15 @@ def saved_model(robot: str | None, path: Path | None, own: frozenset[type] = fro
         from ..storage.saved import load
 
         theirs = frozenset() if robot is None else classes_of(load_robot(robot))
-        saved = load(path, theirs | own)
+        try:
+            saved = load(path, theirs | own)
+        except SaveError as error:
+            if robot is None and "of your class" in str(error):
+                raise ModelError(
+                    f"{path} holds classes of your own: name their file as well, --robot "
+                    "FILE.py:NAME, and --catalogue FILE.py:NAME for an effect"
+                ) from error
+            raise
         if not hasattr(saved, "loop"):
             raise ModelError(f"{path} contains no model: give a saved fit or story")
         return saved.loop
@@ -135,11 +173,23 @@ def saved_model(robot: str | None, path: Path | None, own: frozenset[type] = fro
     try:
         parameters = json.loads(path.read_text(encoding="utf-8"))["parameters"]
         found = {name: float(entry["value"]) for name, entry in parameters.items()}
+    except FileNotFoundError as error:
+        raise ModelError(
+            f"there is no file {path}: give one that `jaxid fit --json` or `jaxid discover --save` "
+            "wrote"
+        ) from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ModelError(
             f"{path} contains no fitted parameters ({error!r}): give a file that "
             "`jaxid fit --json` or `jaxid discover --save` wrote"
         ) from error
+    names = {name for p in loop.parameters for name in p.names}
+    strange = [name for name in found if name not in names]
+    if strange:
+        raise ModelError(
+            f"{path} has {strange[0]}, which {loop.name} has not: it is of another robot, so name "
+            "that with --robot"
+        )
     return loop.with_values(**found)
 
 

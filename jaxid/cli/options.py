@@ -39,12 +39,14 @@ Log = Annotated[
         help="TOML file of columns, units and scales, as written by jaxid inspect --write.",
     ),
 ]
+# None where nothing is said: then the file of --log decides.
 Gaps = Annotated[
-    Literal["refuse", "allow"], typer.Option(help="What to do if a recording has gaps in time.")
+    Literal["refuse", "allow"] | None,
+    typer.Option(help="What to do if a recording has gaps in time; they are refused by default."),
 ]
 Clock = Annotated[
-    Literal["recorded", "even"],
-    typer.Option(help="Times as recorded, or evenly spaced if those of a logger jitter."),
+    Literal["recorded", "even"] | None,
+    typer.Option(help="Times as recorded (default), or evenly spaced if a logger's times jitter."),
 ]
 DropNan = Annotated[
     bool, typer.Option("--drop-nan", help="Leave out samples at which a signal is empty.")

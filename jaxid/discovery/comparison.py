@@ -1,5 +1,6 @@
 """How well a model predicts recordings, and where it fails."""
 
+import dataclasses
 import html
 import os
 from collections.abc import Iterable
@@ -30,6 +31,10 @@ from ..storage.saved import save
 if TYPE_CHECKING:
     import pandas as pd
     import plotly.graph_objects as go
+
+
+# Signals of a run that figures show; tables have been made of them.
+_DRAWN = ("q", "v", "a", "tau", "delivered")
 
 
 class Comparison(AbstractShown):
@@ -90,6 +95,15 @@ class Comparison(AbstractShown):
         time, measured, simulated = self.judged(recording)
         blank = np.where((measured == 0) & (simulated == 0), np.nan, 0.0)
         return time, measured + blank, simulated + blank
+
+    def stored(self) -> "Comparison":
+        """The same for a file: what figures show in single precision, and no states."""
+        runs = []
+        for run in self.runs:
+            rest = {name: np.asarray(getattr(run, name), np.float32) for name in _DRAWN}
+            empty = np.zeros((*run.states.shape[:-1], 0))
+            runs.append(dataclasses.replace(run, states=empty, **rest))
+        return dataclasses.replace(self, runs=tuple(runs))
 
     @property
     def residuals(self) -> tuple[Float[np.ndarray, "_samples joints"], ...]:

@@ -52,6 +52,8 @@ class Verdict(eqx.Module):
 
 # Number of curves whose data a saved discovery keeps for fitting.
 _CURVES = 6
+# Leading entries of a ranking of which is drawn what they explain over time.
+_DRAWN = 4
 
 
 class Diagnosis(AbstractShown):
@@ -65,6 +67,8 @@ class Diagnosis(AbstractShown):
     - `floor`: relative error that a model with every effect and curve that matters leaves, %.
     - `measured`: the noise floor from the recordings alone, if they determine it.
     - `unexplained`: improvement of the score of the model of `floor` over that of the fit.
+    - `errors`: predicted errors of the ranking where no signatures are kept, %, and `shares`: what
+      its leading entries explain of the residual.
     """
 
     fit: Fit | Comparison
@@ -82,6 +86,8 @@ class Diagnosis(AbstractShown):
     significance: float = 0.01
     unexplained: float = 0.0
     measured: Floor | None = None
+    errors: Float[np.ndarray, "ranked joints"] | None = None
+    shares: Float[np.ndarray, "drawn recordings samples outputs"] | None = None
 
     @property
     def best(self) -> AbstractEffect:
@@ -111,6 +117,32 @@ class Diagnosis(AbstractShown):
         products = sorted({c for v in told for c in v.hypothesis.columns})
         return dataclasses.replace(self, data=self.data.only(ranked), gram=self.gram.only(products))
 
+    def stored(self) -> "Diagnosis":
+        """The same for a file: what is shown of signatures in place of them."""
+        errors = [self.predicted_error(v) for v in self.ranking]
+        shares = [self._share(v).astype(np.float32) for v in self.ranking[:_DRAWN]]
+        data = dataclasses.replace(self.data.only(()), base=self.data.base[..., :0])
+
+        def drawn(motion: Motion) -> tuple[Any, ...]:
+            return motion.q, motion.v, motion.a, motion.tau
+
+        single = [np.asarray(x, np.float32) for x in drawn(self.motion)]
+        return dataclasses.replace(
+            self,
+            data=data,
+            motion=eqx.tree_at(drawn, self.motion, single),
+            errors=np.array(errors),
+            shares=np.array(shares),
+        )
+
+    def _share(self, verdict: Verdict) -> Float[np.ndarray, "recordings samples outputs"]:
+        """What an entry explains of the residual after a refit, N·m or N."""
+        if self.shares is not None:
+            for share, leading in zip(self.shares, self.ranking, strict=False):
+                if leading is verdict:
+                    return share
+        return self.data.residual - leftover(self.data, self.noise, verdict.hypothesis.columns)
+
     def predicted(self, verdict: Verdict) -> AbstractEffect:
         """An effect with the amplitudes that its signature predicts."""
         effect, columns = verdict.hypothesis.effect, verdict.hypothesis.columns
@@ -127,6 +159,10 @@ class Diagnosis(AbstractShown):
 
     def predicted_error(self, verdict: Verdict) -> Float[np.ndarray, " joints"]:
         """Relative error on the fitted recordings that adding the effect would leave, %."""
+        if self.errors is not None:
+            place = next((k for k, v in enumerate(self.ranking) if v is verdict), None)
+            if place is not None:
+                return self.errors[place]
         rest = leftover(self.data, self.noise, verdict.hypothesis.columns)
         share = share_left(self.fit, self.data, rest)
         return over_recordings(self.fit.error_percent.to_numpy() * share)
@@ -214,7 +250,9 @@ class Diagnosis(AbstractShown):
             labels, shares, np.array([v.p_value < self.significance for v in top])
         )
 
-    def plot_shares(self, recording: int = 0, joint: int = 1, contenders: int = 4) -> "go.Figure":
+    def plot_shares(
+        self, recording: int = 0, joint: int = 1, contenders: int = _DRAWN
+    ) -> "go.Figure":
         """The part of one joint's residual over time that each contender explains after a refit.
 
         **Arguments:**
@@ -227,8 +265,7 @@ class Diagnosis(AbstractShown):
         keep = self.data.mask[recording]
         shares = {}
         for verdict in self.ranking[:contenders]:
-            rest = leftover(self.data, self.noise, verdict.hypothesis.columns)
-            shares[_label(verdict)] = (self.data.residual - rest)[recording, keep, joint - 1]
+            shares[_label(verdict)] = self._share(verdict)[recording, keep, joint - 1]
         residual = self.data.residual[recording, keep, joint - 1]
         time = np.asarray(self.motion.t)[recording, keep]
         unit = self.fit.loop.arm.units()[0][joint - 1]

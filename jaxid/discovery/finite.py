@@ -82,9 +82,16 @@ def differences(
         return []
     if not imposed(loop):
         return [run - np.asarray(nominal) for run in _simulated(loop, batch, effects, row)]
-    # With them the motion is not given any more: what feedback errs by is to be in both.
-    *runs, without = _simulated(loop, batch, [*effects, TorqueSaturation(joint=1)], row)
-    return [run - without for run in runs]
+    still = [k for k, e in enumerate(effects) if imposed(loop.add(e))]
+    runs = _simulated(loop, batch, [effects[k] for k in still], row)
+    found = {k: run - np.asarray(nominal) for k, run in zip(still, runs, strict=True)}
+    parted = [k for k in range(len(effects)) if k not in found]
+    if parted:
+        # With them the motion is not given any more: what feedback errs by is to be in both.
+        several = [*(effects[k] for k in parted), TorqueSaturation(joint=1)]
+        *runs, without = _simulated(loop, batch, several, row)
+        found |= {k: run - without for k, run in zip(parted, runs, strict=True)}
+    return [found[k] for k in range(len(effects))]
 
 
 def _simulated(

@@ -1,5 +1,6 @@
 """The result of a discovery: its steps, its verdict, and its display."""
 
+import dataclasses
 import html
 import os
 from collections import Counter
@@ -289,7 +290,23 @@ class Discovery(AbstractShown):
 
         **Raises:** `SaveError` if it cannot be written.
         """
-        return save(self, path)
+        return save(self.stored(), path)
+
+    def stored(self) -> "Discovery":
+        """The same for a file: all that it shows, without the signatures and states behind it.
+
+        `jaxid.diagnose` and `jaxid.compare` make these again.
+        """
+
+        def light(given: Any) -> Any:
+            return None if given is None else given.stored()
+
+        steps = [
+            dataclasses.replace(s, held_out=light(s.held_out), diagnosis=light(s.diagnosis))
+            for s in self.steps
+        ]
+        rows = [dataclasses.replace(m, held_out=light(m.held_out)) for m in self.considered]
+        return dataclasses.replace(self, steps=tuple(steps), considered=tuple(rows))
 
     def to_dict(self) -> dict[str, Any]:
         """The story as plain JSON, the format of `jaxid discover --json`."""

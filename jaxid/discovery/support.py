@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, AbstractTransmission, TorqueSaturation
 from .explore import Candidate
 from .hypotheses import free_of
 from .predict import Predictor
@@ -37,7 +37,8 @@ def unsupported(predictor: Predictor, c: Candidate) -> tuple[AbstractEffect, ...
     return tuple(
         effect
         for k, effect in enumerate(c.effects)
-        if not effect.finite and _share(predictor, c, k, stretch) < _SUPPORTED
+        if not isinstance(effect, AbstractTransmission | TorqueSaturation)
+        and _share(predictor, c, k, stretch) < _SUPPORTED
     )
 
 

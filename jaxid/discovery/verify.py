@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from ..effects import AbstractEffect, Coulomb
+from ..effects import AbstractEffect, AbstractTransmission, Coulomb
 from ..estimate import OEM, Fit, SeparablePEM, Status, fit
 from ..noise import ARFilter
 from ..parameters import Bounds, read_values, write_values
@@ -103,7 +103,7 @@ def quiet(method: OEM) -> OEM:
 
 
 def held_shapes(loop: ClosedLoop, last: int) -> tuple[str, ...]:
-    """Names of the last effects' parameters that no fit estimates unless told to.
+    """Names of the last transmissions' parameters that no fit estimates unless told to.
 
     **Arguments:**
 
@@ -115,7 +115,7 @@ def held_shapes(loop: ClosedLoop, last: int) -> tuple[str, ...]:
         for p in loop.parameters
         if p.place[0] == "effects"
         and int(p.place[1]) >= first
-        and loop.effects[int(p.place[1])].finite
+        and isinstance(loop.effects[int(p.place[1])], AbstractTransmission)
         and not p.declaration.free
     )
 

@@ -30,6 +30,8 @@ class GearFriction(AbstractEffect):
 
     joint_fields = ("joint",)
     loaded = True
+    # Where friction holds an arm under load, its slope at nothing tells a fraction of what it does.
+    finite = True
     joint: int = eqx.field(static=True)
     drive: Scalar = parameter(0.0, symbol="Km", unit="1", lower=0.0, upper=0.9, scale=0.1)
     back: Scalar | None = parameter(None, symbol="Ke", unit="1", lower=0.0, upper=0.9, scale=0.1)
@@ -51,8 +53,16 @@ class GearFriction(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["GearFriction"]:
-        """Every joint, with one ratio for both sides and no peak."""
-        return [cls(joint=j, smoothing=scene.smoothed(j)) for j in scene.joints]
+        """Some ratios for both sides, and one that is twice as high below some velocities."""
+        made = []
+        for j in scene.joints:
+            own = {"joint": j, "smoothing": scene.smoothed(j)}
+            made += [cls(drive=ratio, **own) for ratio in (0.05, 0.1, 0.2)]
+            made += [
+                cls(drive=0.1, slow=0.1, velocity=share * scene.speed[j - 1], **own)
+                for share in (0.02, 0.1, 0.5)
+            ]
+        return made
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """The friction on the joint, `(joints,)`."""
@@ -61,7 +71,9 @@ class GearFriction(AbstractEffect):
         tau, load, v = motion.tau[j], motion.load[j], motion.v[j]
 
         def of(drive: Scalar, back: Scalar | None) -> Float[Array, ""]:
-            return jnp.abs(drive * tau + (drive if back is None else back) * load)
+            both = drive * tau + (drive if back is None else back) * load
+            # At no friction its size has no slope by itself: that of two equal ratios.
+            return both * jnp.sign(jnp.where(both == 0, tau + load, both))
 
         level = of(self.drive, self.back)
         if self.velocity is not None:

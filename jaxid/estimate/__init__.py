@@ -1,5 +1,6 @@
 """Estimation methods, one file each, called through `fit(loop, recordings, method)`."""
 
+from ._fit import doubtful_joints as doubtful_joints
 from ._fit import fit as fit
 from .covariance import deviations as deviations
 from .covariance import with_deviations as with_deviations

@@ -5,14 +5,17 @@ import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ..arms import SerialArm, physical_bodies
+from ..control import Reading, Sampled
 from ..effects import AbstractEffect, AbstractTransmission, check_declared
 from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
-from ..simulation.batch import check_joints, check_law
+from ..simulation.batch import at_rest, check_joints, check_law
 from ..simulation.loop import ClosedLoop
 from .oem import OEM
 from .result import AbstractMethod, Fit, Status
@@ -53,6 +56,7 @@ def fit(
         _check_rigid(loop, method)
     found = _followed(_doubted(_honest(method.fit(loop, recordings))))
     notes = (*found.notes, *_matter(found), *_band(loop, recordings), *_gaps(recordings))
+    notes = (*notes, *_restarted(loop, recordings))
     return dataclasses.replace(found, notes=notes)
 
 
@@ -110,6 +114,21 @@ def _band(loop: ClosedLoop, recordings: Recordings) -> list[str]:
     return [f"torque is compared below {cutoff:.3g} Hz, up to which the recorded motion is known"]
 
 
+def _restarted(loop: ClosedLoop, recordings: Recordings) -> list[str]:
+    """A note on recordings in whose midst a law with states of its own begins anew."""
+    law, zeros = loop.controller, jnp.zeros(loop.joints)
+    law = law.law if isinstance(law, Sampled) else law
+    own = jax.tree.leaves(law.initial_state(Reading(zeros, zeros)))
+    moving = [r.name for r in recordings if not at_rest(r)]
+    if not moving or not sum(leaf.size for leaf in own):
+        return []
+    return [
+        f"{len(moving)} of {len(recordings)} recordings, {moving[0]} the first, begin in motion, "
+        f"and the states of {type(law).__name__} with them as at its start (an integral at zero): "
+        "begin a recording where the law is switched on, or where the arm has been at rest"
+    ]
+
+
 def _gaps(recordings: Recordings) -> list[str]:
     """Notes on recordings with gaps."""
     return [
@@ -152,9 +171,7 @@ def _doubted(found: Fit) -> Fit:
     settled = found.status in (Status.converged, Status.stalled)
     if settled and (left.min() > 99.0 or left.max() > 105.0):
         found = dataclasses.replace(found, status=Status.misfit)
-    largest = errors.to_numpy().max(axis=0)
-    by_joint = {str(c): float(x) for c, x in zip(errors.columns, largest, strict=True)}
-    worst = {label: value for label, value in by_joint.items() if value > _DOUBTFUL_PERCENT}
+    worst = doubtful_joints(found)
     if not worst:
         return found
     joints = ", ".join(f"{label} {value:.3g} %" for label, value in worst.items())
@@ -163,6 +180,14 @@ def _doubted(found: Fit) -> Fit:
         "signs, the control law and its gains, and whether the motion is larger than the noise"
     )
     return dataclasses.replace(found, notes=(*found.notes, note))
+
+
+def doubtful_joints(found: Fit) -> dict[str, float]:
+    """Joints of which a fit leaves more than a good model does, with the share that is left, %."""
+    errors = found.error_percent * _of_motion(found)
+    largest = errors.to_numpy().max(axis=0)
+    by_joint = {str(c): float(x) for c, x in zip(errors.columns, largest, strict=True)}
+    return {label: value for label, value in by_joint.items() if value > _DOUBTFUL_PERCENT}
 
 
 def _followed(found: Fit) -> Fit:

@@ -1,12 +1,13 @@
 """Start values of output error, from inverse dynamics if they are better."""
 
+import warnings
 from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
 
 from ..control import OpenLoop
-from ..errors import JaxidError, ModelError
+from ..errors import JaxidError, JaxidWarning, ModelError
 from ..recording import Recordings
 from ..simulation.batch import Batch, prepare
 from ..simulation.loop import ClosedLoop
@@ -45,7 +46,8 @@ def start_values(
             continue
         if np.isfinite(theta).all():
             candidates.append(physical(loop, theta))
-            errors.append(_simulated_error(candidates[-1], recordings, batch))
+            most = _STIFFER * _steps(loop, recordings)
+            errors.append(_simulated_error(candidates[-1], recordings, batch, most))
         if min(errors) < _NEAR:
             break
     if isinstance(loop.controller, OpenLoop):
@@ -63,14 +65,33 @@ def _by_didim(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " l
 
 # Share of the squared torque, mean over joints, below which no better start is needed.
 _NEAR = 0.2**2
+# Steps of a start over those of the loop as it is, above which an inertia is almost zero: of
+# recordings with a mistake in them, whose fit would take an hour for each of its steps.
+_STIFFER = 10
 
 
-def _simulated_error(loop: ClosedLoop, recordings: Recordings, batch: Batch) -> float:
+def _steps(loop: ClosedLoop, recordings: Recordings) -> float:
+    """Steps between two samples that a loop needs; infinite if they are too many."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", JaxidWarning)
+        try:
+            return with_substeps(loop, recordings).stepping.substeps or 1
+        except ModelError:
+            return np.inf
+
+
+def _simulated_error(
+    loop: ClosedLoop, recordings: Recordings, batch: Batch, most: float = np.inf
+) -> float:
     """Mean over joints of the squared relative torque error of a simulation; infinite if it fails.
 
     An open loop has no torque to compare.
+
+    **Arguments:**
+
+    - `most`: steps between two samples; a loop that needs more counts as one that fails.
     """
-    if isinstance(loop.controller, OpenLoop):
+    if isinstance(loop.controller, OpenLoop) or _steps(loop, recordings) > most:
         return np.inf
     try:
         tau = simulate_batch(with_substeps(loop, recordings), batch).tau

@@ -6,23 +6,20 @@ from typing import Literal, get_args
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
 from ..errors import JaxidWarning, brief
-from ._problem import problem
+from ._problem import Labels, Lines, label, place, problem
+from ._times import Gaps, even, increasing, missing_after, steady
 from ._units import HELD, SIGNALS, Units, factors
 
-Gaps = Literal["refuse", "allow"]
 Nan = Literal["refuse", "drop"]
 Clock = Literal["recorded", "even"]
-Labels = Mapping[str, Sequence[str]]
-Lines = Sequence[int]
 
 _FEWEST_SAMPLES = 20
 _LARGEST = 1e30
-# A warning needs at least this jitter of times, in steps, and a motion that is smoother on even
-# times by at least this factor.
-_JITTER, _ROUGHER = 0.05, 2.0
+# Smallest jump of a position that is reported, in units of nearly its largest usual step.
+_JUMP = 20.0
 
 
 class Accept(eqx.Module):
@@ -120,11 +117,6 @@ def is_number(cell: object) -> bool:
     return True
 
 
-def place(row: int, lines: Lines) -> str:
-    """The place of a row, counted from 0: its line in the file, or its index in an array."""
-    return f"line {lines[row]}" if lines else f"row {row + 1}"
-
-
 def validate(
     source: str,
     signals: Mapping[str, Float64[np.ndarray, "..."]],
@@ -176,12 +168,13 @@ def validate(
         _finite(source, signal, checked[signal], labels, lines)
         _bounded(source, signal, checked[signal], labels, lines)
     if accept.clock == "even":
-        checked["time"] = _even(source, checked["time"])
-    _increasing(source, checked["time"], labels, accept.gaps, lines)
-    _steady(source, checked)
+        checked["time"] = even(source, checked["time"])
+    increasing(source, checked["time"], labels, accept.gaps, lines)
+    steady(source, checked)
     for signal in ("q", "tau"):
         _moving(source, signal, checked[signal], labels)
     _plausible(source, checked, units or {})
+    _continuous(source, checked, labels, lines)
     return checked
 
 
@@ -202,49 +195,6 @@ def _without_blanks(
     )
     kept = tuple(line for line, gone in zip(lines, blank, strict=True) if not gone) if lines else ()
     return {name: x[~blank] for name, x in signals.items()}, kept
-
-
-def _even(source: str, time: Float64[np.ndarray, " samples"]) -> Float64[np.ndarray, " samples"]:
-    """Evenly spaced times, by a straight line through the recorded ones."""
-    number = np.arange(len(time))
-    slope, first = np.polyfit(number, time, 1)
-    if not slope > 0:
-        raise problem(source, "time does not increase over the recording", "give it in seconds")
-    return first + slope * number
-
-
-def _steady(source: str, signals: Mapping[str, Float64[np.ndarray, "..."]]) -> None:
-    """Warns of times that jitter although the samples are evenly spaced.
-
-    A motion is smooth over its true times. If it is much smoother over even times, those are the
-    true ones, and the recorded times are a logger's.
-    """
-    time, q = signals["time"], signals["q"]
-    steps = np.diff(time)
-    usual = float(np.median(steps))
-    jitter = float(np.quantile(np.abs(steps - usual), 0.9))
-    if jitter < _JITTER * usual or missing_after(time).any():
-        return
-    even = np.linspace(time[0], time[-1], len(time))
-    rough = [
-        np.std(np.diff(np.diff(q, axis=0) / np.diff(t)[:, None], axis=0)) for t in (time, even)
-    ]
-    if rough[0] > _ROUGHER * rough[1]:
-        warnings.warn(
-            f"{source}: times jitter by {1e3 * jitter:.3g} ms about {1e3 * usual:.3g} ms, and "
-            f"positions are {rough[0] / rough[1]:.2g} times as smooth on even times, so these are "
-            "probably times of a logger, not those at which the drive sampled; pass "
-            'clock="even" (--clock even), or record the drive\'s own times.',
-            JaxidWarning,
-            stacklevel=5,
-        )
-
-
-def _label(labels: Labels, signal: str, joint: int, joints: int) -> str:
-    names = labels.get(signal, ())
-    if len(names) == joints:
-        return names[joint]
-    return f"{names[0] if names else signal}_{joint + 1}"
 
 
 def _shapes(
@@ -296,7 +246,7 @@ def _finite(
     row, joint = np.argwhere(~np.isfinite(table))[0].tolist()
     raise problem(
         source,
-        f"{_label(labels, signal, joint, table.shape[1])}, {place(row, lines)} is empty or not "
+        f"{label(labels, signal, joint, table.shape[1])}, {place(row, lines)} is empty or not "
         f"finite ({table[row, joint]})",
         'remove that sample, or pass nan="drop" to leave such samples out (--drop-nan)',
     )
@@ -311,48 +261,10 @@ def _bounded(
     if abs(table[row, joint]) > _LARGEST:
         raise problem(
             source,
-            f"{_label(labels, signal, int(joint), table.shape[1])} reaches {table[row, joint]:.3g} "
+            f"{label(labels, signal, int(joint), table.shape[1])} reaches {table[row, joint]:.3g} "
             f"in SI units at {place(int(row), lines)}",
             "correct it, or give its unit",
         )
-
-
-def _increasing(
-    source: str, time: Float64[np.ndarray, " samples"], labels: Labels, gaps: Gaps, lines: Lines
-) -> None:
-    label = _label(labels, "time", 0, 1)
-    with np.errstate(over="ignore"):
-        steps, span = np.diff(time), time[-1] - time[0]
-    if not (steps > 0).all():
-        row = int(np.argmin(steps > 0))
-        verb = "repeats" if steps[row] == 0 else "goes back"
-        raise problem(
-            source,
-            f"{label} {verb} at {place(row + 1, lines)} ({time[row + 1]:.9g} s after "
-            f"{time[row]:.9g} s)",
-            "sort the rows by time and drop the repeated ones",
-        )
-    if not np.isfinite(span):
-        raise problem(source, f"{label} spans more than float64 can hold", "give it in seconds")
-    too_long = missing_after(time)
-    if gaps != "allow" and too_long.any():
-        row = int(np.argmax(too_long))
-        raise problem(
-            source,
-            f"{label} has a gap of {steps[row]:.4g} s before {place(row + 1, lines)}, but the "
-            f"usual step is {np.median(steps):.4g} s",
-            'split the recording there, or pass gaps="allow" (--gaps allow)',
-        )
-
-
-def missing_after(time: Float64[np.ndarray, " samples"]) -> Bool[np.ndarray, " steps"]:
-    """Samples that are followed by a gap.
-
-    A gap is a step of more than five times the 95th percentile of all steps. Five times the median
-    would find gaps in uneven sampling, which has many long steps.
-    """
-    steps = np.diff(time)
-    return steps / 5 > np.quantile(steps, 0.95, method="lower")
 
 
 def _moving(
@@ -362,7 +274,7 @@ def _moving(
         if (column == column[0]).all():
             raise problem(
                 source,
-                f"{signal} of joint {joint + 1} ({_label(labels, signal, joint, len(values.T))}) "
+                f"{signal} of joint {joint + 1} ({label(labels, signal, joint, len(values.T))}) "
                 f"is constant at {column[0]:.6g}",
                 "check the column's name, or leave that joint out of q and tau",
             )
@@ -392,6 +304,32 @@ def _plausible(
         warnings.warn(
             f"{source}: samples are {np.median(np.diff(signals['time'])):.4g} s apart, which looks "
             'like milliseconds; pass units={"time": "ms"}, or units={"time": "s"} if it is right.',
+            JaxidWarning,
+            stacklevel=5,
+        )
+
+
+def _continuous(
+    source: str, signals: Mapping[str, Float64[np.ndarray, "..."]], labels: Labels, lines: Lines
+) -> None:
+    """Warns of a position that jumps: an outlier, or an angle that is cut off at a turn."""
+    whole = ~missing_after(signals["time"])
+    for joint, column in enumerate(signals["q"].T):
+        steps = np.where(whole, np.abs(np.diff(column)), 0.0)
+        usual = float(np.quantile(steps, 0.99))
+        # An outlier jumps there and back by nearly the same.
+        row = int(np.argmax(steps > 0.9 * steps.max()))
+        if usual == 0 or steps[row] < _JUMP * usual:
+            continue
+        turned = abs(steps[row] - 2 * np.pi) < 0.1 * np.pi
+        remedy = (
+            "which is a turn: unwrap the angle (numpy.unwrap)"
+            if turned
+            else "where it moves on less at nearly all others: correct that sample, or cut there"
+        )
+        warnings.warn(
+            f"{source}: {label(labels, 'q', joint, signals['q'].shape[1])} jumps by "
+            f"{steps[row]:.3g} rad or m at {place(row + 1, lines)}, {remedy}.",
             JaxidWarning,
             stacklevel=5,
         )

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import JaxidError, RecordingError, brief, require
 from ._bag import bag_name, bag_table, is_bag
-from ._checks import Accept, Clock, Gaps, Nan, is_number
+from ._checks import Accept, Clock, Nan, is_number
 from ._columns import labels_of, pick
 from ._description import Columns, Description, Resolution, Scale
 from ._hdf5 import hdf5_table
@@ -25,6 +25,7 @@ from ._numpy import npz_table
 from ._problem import problem
 from ._recording import Recordings, build
 from ._table import Table, from_frame, unique
+from ._times import Gaps
 from ._units import Units
 
 # Two million samples of seven columns as text; a laptop has the memory to read them.

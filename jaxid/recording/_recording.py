@@ -10,13 +10,14 @@ import numpy as np
 from jaxtyping import Float64
 
 from ..errors import brief, near
-from ._checks import Accept, Clock, Gaps, Nan, numeric, validate
+from ._checks import Accept, Clock, Nan, numeric, validate
 from ._columns import Picked, pick
 from ._description import Columns, Description, Resolution, Scale
 from ._problem import problem
 from ._steps import quantum
 from ._table import from_frame
 from ._tables import frame_of
+from ._times import Gaps
 from ._units import HELD, SIGNALS, Units
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from ..errors import JaxidWarning
-from ._checks import missing_after
 from ._problem import problem
+from ._times import missing_after
 
 # Time steps by which a message may arrive after one with a later stamp.
 _LATE = 10

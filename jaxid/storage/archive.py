@@ -66,7 +66,7 @@ def pack(value: Any) -> bytes:
         "objects": packer.objects,
         "arrays": [digest for digest, _ in packer.arrays],
     }
-    text = json.dumps(manifest, indent=1, allow_nan=False).encode()
+    text = json.dumps(manifest, separators=(",", ":"), allow_nan=False).encode()
     members = {"manifest.json": text, "manifest.sha256": _digest(text).encode()}
     members |= {f"{k}.npy": content for k, (_, content) in enumerate(packer.arrays)}
     buffer = io.BytesIO()
@@ -83,6 +83,8 @@ class _Packer:
     def __init__(self) -> None:
         self.objects: list[dict[str, Any]] = []
         self.arrays: list[tuple[str, bytes]] = []
+        # Fits of the same recordings contain equal arrays, each of which is written once.
+        self._places: dict[str, int] = {}
         # The objects of the tree stay alive, so identities are unique.
         self._seen: dict[int, Any] = {}
 
@@ -150,8 +152,11 @@ class _Packer:
         plain = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False))
         np.lib.format.write_array(buffer, plain.reshape(array.shape), allow_pickle=False)
         content = buffer.getvalue()
-        self.arrays.append((_digest(content), content))
-        return {"array": len(self.arrays) - 1, "jax": isinstance(value, jax.Array)}
+        digest = _digest(content)
+        if digest not in self._places:
+            self._places[digest] = len(self.arrays)
+            self.arrays.append((digest, content))
+        return {"array": self._places[digest], "jax": isinstance(value, jax.Array)}
 
     def _frame(self, frame: "pd.DataFrame", where: str) -> Any:
         levels = [frame.index.get_level_values(k) for k in range(frame.index.nlevels)]
