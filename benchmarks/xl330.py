@@ -1,11 +1,12 @@
 """A hobby servo with a pendulum (XL330, measured): friction models, and a discovery.
 
-The five models of friction are those of the recordings' README. Their error is given at the values of
-the README, after a fit by least squares, and after a minimisation of the error itself by the method
-of Nelder and Mead, as in the README. A model starts from the values of the one that it contains, so
-it cannot end worse. The error is the mean absolute position error over twelve recordings, each
-simulated from its first sample to its end. Then `discover` starts from M1 on the recordings at kp 100
-and 800, tested on those at kp 400. Finally the models are expressed in a simulator's parameters.
+The five models of friction are those of the recordings' README. Their error is given at the values
+of the README, after a fit by least squares, and after a minimisation of the error itself by the
+method of Nelder and Mead, as in the README. A model starts from the values of the one that it
+contains, so it cannot end worse. The error is the mean absolute position error over twelve
+recordings, each simulated from its first sample to its end. Then `discover` starts from M1 on the
+recordings at kp 100 and 800, tested on those at kp 400. Finally the models are expressed in a
+simulator's parameters.
 
 python -m benchmarks.xl330 [--quick] [--json FILE]
 """
