@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.extend.backend
 import numpy as np
+from jax.core import Tracer
 
 # JAX has no public functions for these questions. If a later version has moved them, the flag is
 # set as if no backend ran. If a backend does run, the flag has no effect, and XLA's own level
@@ -70,7 +71,7 @@ def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result
 
     def with_arrays(leaves: list[Any], structure: Any) -> _Result:
         args, kwargs = jax.tree.unflatten(structure, map(_as_arrays, leaves))
-        return fun(*args, **kwargs)
+        return fun(*args, **kwargs)  # type: ignore[reportCallIssue]
 
     # By which profiles and caches of compiled programs call it.
     with_arrays.__name__ = with_arrays.__qualname__ = fun.__name__
@@ -121,7 +122,7 @@ def _as_constants(module: Any) -> Any:
     """A module with its constants as a part of the program; anything else is left unchanged."""
     names = getattr(type(module), "constants", ())
     fields = {name: vars(module)[name] for name in names}
-    if not names or any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(fields)):
+    if not names or any(isinstance(x, Tracer) for x in jax.tree.leaves(fields)):
         return module
     return _with_fields(module, {name: _Constant(value) for name, value in fields.items()})
 

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .errors import ModelError
@@ -189,7 +190,7 @@ def read_values(model: Any, parameters: Sequence[Parameter]) -> Vector:
     - `parameters`: which, and in which order.
     """
     values = [p.where(model) for p in parameters]
-    if any(isinstance(x, jax.core.Tracer) for x in values):
+    if any(isinstance(x, Tracer) for x in values):
         return jnp.concatenate([jnp.ravel(x) for x in values])
     return jax.device_put(np.concatenate([np.zeros(0), *map(np.ravel, values)]))
 
@@ -209,7 +210,7 @@ def write_values(
     """
     if not parameters:
         return model
-    traced = isinstance(values, jax.core.Tracer)
+    traced = isinstance(values, Tracer)
     pieces, start = [], 0
     for p in parameters:
         piece = (values if traced else np.asarray(values))[start : start + p.size]
@@ -314,7 +315,7 @@ class Bounds(eqx.Module):
 
         Values inside are unchanged, even close to a bound: all values of a small robot are small.
         """
-        traced = isinstance(values, jax.core.Tracer)
+        traced = isinstance(values, Tracer)
         xp = jnp if traced else np
         x, low, high, scale = map(xp.asarray, (values, self.lower, self.upper, self.scale))
         # As far inside as `outside` moves them.

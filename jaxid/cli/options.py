@@ -39,7 +39,7 @@ Log = Annotated[
         help="TOML file of columns, units and scales, as written by jaxid inspect --write.",
     ),
 ]
-# None where nothing is said: then the file of --log decides.
+# If neither is given, the file of --log decides.
 Gaps = Annotated[
     Literal["refuse", "allow"] | None,
     typer.Option(help="What to do if a recording has gaps in time; they are refused by default."),

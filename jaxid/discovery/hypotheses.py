@@ -79,7 +79,7 @@ def survey(
     speed = np.abs(np.asarray(motion.v)).reshape(-1, loop.joints).max(axis=0)
     # Always so many positions, for one program.
     chosen = np.linspace(0, len(q) - 1, _POSITIONS).astype(int)
-    mass = np.asarray(_mass_matrices(loop.arm, q[chosen]))
+    mass = np.asarray(_mass_matrices(loop.arm, jax.device_put(q[chosen])))
     # Rotors are effects: without them a wrist with drawn bodies may have almost no inertia.
     mass = mass + 1e-6 * np.trace(mass, axis1=1, axis2=2)[:, None, None] * np.eye(loop.joints)
     smoothed = {e.joint: float(e.smoothing) for e in loop.effects if isinstance(e, Coulomb)}

@@ -183,7 +183,7 @@ def force_and_slopes(
     **Returns:** torque on the joint, N·m or N, position reading, rad or m, and velocity reading,
     rad/s or m/s; the first column is the value, the others are derivatives.
     """
-    return one_by_one(lambda one: _force_and_slopes(placed, *one, fields), (motion, left))
+    return one_by_one(lambda one: _force_and_slopes(placed, one[0], one[1], fields), (motion, left))
 
 
 @compiled

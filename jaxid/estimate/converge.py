@@ -73,13 +73,8 @@ def converge(
     signals = compared_signals(method, loop)
     batch = prepare(loop, pieces) if batch is None else batch
     estimated = estimated_starts(method, pieces, batch)
-    free, first, start = jax.device_put(
-        (
-            estimated,
-            first_weights(loop, pieces, signals),
-            np.concatenate([batch.q0, batch.v0], axis=1),
-        )
-    )
+    free, first = map(jax.device_put, (estimated, first_weights(loop, pieces, signals)))
+    start = jax.device_put(np.concatenate([batch.q0, batch.v0], axis=1))
     bounds = _resolved(loop, recordings)
     if weights is None and filters is not None:
         weights = _weights_of(filters, first)
@@ -87,7 +82,7 @@ def converge(
     alone = len(first) == 1
     # Until the weights are known, a rough minimum is enough.
     worth = 1e-4 if alone or weights is not None else 1e-2
-    weights = first if weights is None else weights
+    weights = jnp.asarray(first if weights is None else weights)
 
     def posed(weights: Float[Array, " outputs"]) -> Problem:
         within = bounds.lower, bounds.upper

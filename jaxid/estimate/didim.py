@@ -4,6 +4,7 @@ import dataclasses
 import time
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -26,7 +27,7 @@ def physical(loop: ClosedLoop, theta: Float[np.ndarray, " parameters"]) -> Close
 
     - `theta`: values of the parameters in which torque is linear, `(parameters,)`.
     """
-    moved, inertia = _moved(loop, np.asarray(theta))
+    moved, inertia = _moved(loop, jax.device_put(theta))
     return moved if float(inertia) > 0 else loop
 
 

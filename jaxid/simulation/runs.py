@@ -246,7 +246,7 @@ def by_recording(
 
 def simulate_batch(loop: ClosedLoop, batch: Batch) -> Simulated:
     """Simulates the loop along a batch; leaves have `(recordings, samples)` first, padded."""
-    substeps = None
+    substeps: Any = None
     forward = isinstance(loop.stepping.adjoint, diffrax.ForwardMode)
     if loop.stepping.control is None and forward:
         # One program serves any number of steps; refining them needs no compilation.
