@@ -44,8 +44,10 @@ class Peer:
 def of_jaxid(recs: jaxid.Recordings, alone: bool = False) -> Peer:
     """The repeated part of a fit by jaxid: weighted residual, Jacobian and normal equations.
 
-    On all cores, over which recordings are distributed, or on one core.
+    On all cores, over which recordings are distributed, or on one core. It simulates the padding
+    of its batch as well, which the other programs do not have.
     """
+    samples = recs[0].samples
     started = time.perf_counter()
     loop = cad()
     batch = prepare(loop, recs)
@@ -61,11 +63,11 @@ def of_jaxid(recs: jaxid.Recordings, alone: bool = False) -> Peer:
         def one(intervals, q0, v0):
             return run(changed, intervals, initial(changed, intervals, q0, v0))[1][:, 0]
 
-        return each(one, batch.intervals, batch.q0, batch.v0)
+        return each(one, batch.intervals, batch.q0, batch.v0)[:, :samples]
 
     def jacobian(theta):
         found = around(jnp.asarray(theta), start).found
-        return found.raw, found.jacobian
+        return found.raw[:, :samples], found.jacobian[:, :samples]
 
     once(lambda: jacobian(np.asarray(loop.theta)))
     name = "jaxid, one core" if alone else "jaxid"

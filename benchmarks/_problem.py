@@ -83,17 +83,17 @@ def problem(loop: jaxid.ClosedLoop, batch: Batch, mesh: jax.sharding.Mesh | None
 
 
 def arrays(recs: jaxid.Recordings) -> list[dict[str, np.ndarray]]:
-    """Data of each recording for peers: lengths of intervals, cubics, start, torque."""
+    """Data of each recording for peers, without padding: intervals, cubics, start, torque."""
     batch = prepare(cad(), recs)
     return [
         {
-            "time": np.asarray(batch.time[k]),
-            "h": np.ascontiguousarray(batch.intervals.h[k]),
-            "reference": np.ascontiguousarray(batch.intervals.reference[k]),
+            "time": np.asarray(batch.time[k, :n]),
+            "h": np.ascontiguousarray(batch.intervals.h[k, :n]),
+            "reference": np.ascontiguousarray(batch.intervals.reference[k, :n]),
             "start": np.concatenate([batch.q0[k], batch.v0[k]]),
-            "tau": np.asarray(batch.tau[k]),
+            "tau": np.asarray(batch.tau[k, :n]),
         }
-        for k in range(len(recs))
+        for k, n in enumerate(r.samples for r in recs)
     ]
 
 

@@ -1,8 +1,8 @@
 """A fleet of simulated axes: one table from processes, from Dask, and from a run that was killed.
 
 Each robot is an axis with a mass and friction of its own, whose model knows neither. Some have a
-worn joint: a spring (a cable that pulls) or Stribeck friction. The recordings of one robot contain no
-torque. Every discovery is done by the default executor; by Dask, if `distributed` is installed;
+worn joint: a spring (a cable that pulls) or Stribeck friction. The recordings of one robot contain
+no torque. Every discovery is done by the default executor; by Dask, if `distributed` is installed;
 and by the default executor with a folder for the results, ended by SIGKILL in the middle and begun
 again. The tables must say the same; numbers may differ by rounding, since workers of Dask give
 linear algebra one thread.

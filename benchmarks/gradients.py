@@ -66,7 +66,8 @@ def simulation(recs: jaxid.Recordings, adjoint: diffrax.AbstractAdjoint | None) 
     loop = cad()
     batch = prepare(loop, recs)
     # NumPy arrays, because the backsolve adjoint gives no derivative by closed-over values.
-    drives = jax.tree.map(np.asarray, (batch.intervals, batch.q0, batch.v0))
+    intervals = jax.tree.map(lambda x: np.asarray(x)[:, : recs[0].samples], batch.intervals)
+    drives = intervals, np.asarray(batch.q0), np.asarray(batch.v0)
 
     def own(theta: Theta) -> Array:
         changed = loop.with_theta(theta)

@@ -178,7 +178,7 @@ def test_no_success_with_a_number_that_is_none(plain: jaxid.Fit) -> None:
         with np.errstate(invalid="ignore"):
             fit = jaxid.fit(plain.loop, plain.recordings, Wrong(wrong))
         assert fit.status is jaxid.Status.overflowed
-        assert "not a number" in fit.notes[-1]
+        assert "not numbers (NaN)" in fit.notes[-1]
     # What is infinitely uncertain is an answer.
     infinite = dataclasses.replace(plain, covariance=np.full_like(plain.covariance, np.inf))
     assert jaxid.fit(plain.loop, plain.recordings, Wrong(infinite)).succeeded

@@ -118,11 +118,12 @@ def test_an_effect_that_leaves_the_motion_given_is_held_against_the_given_run(re
     """Under an unknown law friction in a gear needs no feedback, and a torque limit does."""
     loop = jaxid.scara(jaxid.control.Tracking())
     batch = prepare(loop, jaxid.Recordings.of(record))
-    plain = jaxid.simulate(loop, record)[0].tau
+    plain = np.asarray(simulate_batch(loop, batch).tau)
     effects = [TorqueSaturation(1, 1e9), GearFriction(joint=1, drive=0.1)]
-    limit, gear = differences(loop, batch, effects, 0, jnp.asarray(plain)[None])
+    limit, gear = differences(loop, batch, effects, 0, jnp.asarray(plain))
     alone = jaxid.simulate(loop.add(effects[1]), record)[0].tau
-    np.testing.assert_allclose(plain + gear[0], alone, atol=1e-12 * np.abs(alone).max())
+    found = (plain + gear)[0, : record.samples]
+    np.testing.assert_allclose(found, alone, atol=1e-12 * np.abs(alone).max())
     assert np.abs(gear).max() > 0.01 * np.abs(plain).max()
     # A limit that is never reached changes nothing, whatever feedback errs by.
     np.testing.assert_allclose(limit, 0.0, atol=1e-9 * np.abs(plain).max())

@@ -161,9 +161,11 @@ def saved_model(robot: str | None, path: Path | None, own: frozenset[type] = fro
             saved = load(path, theirs | own)
         except SaveError as error:
             if robot is None and "of your class" in str(error):
+                # The remedy is for Python.
+                what = str(error).partition("; pass it")[0]
                 raise ModelError(
-                    f"{path} holds classes of your own: name their file as well, --robot "
-                    "FILE.py:NAME, and --catalogue FILE.py:NAME for an effect"
+                    f"{what}: name its file, --robot FILE.py:NAME, or --catalogue FILE.py:NAME "
+                    "for an effect"
                 ) from error
             raise
         if not hasattr(saved, "loop"):

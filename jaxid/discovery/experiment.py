@@ -204,7 +204,7 @@ def _separations(
     sizes = [diagnosis.gram.amplitude(v.hypothesis.columns)[0] for v in chosen]
     scores, runs = np.full(len(drawn), np.nan), []
     for k, recording in enumerate(drawn):
-        tau, q = seen[k, :, 0], seen[k, :, 1]
+        tau, q = seen[k, : recording.samples, 0], seen[k, : recording.samples, 1]
         runs.append(Recording(recording.time, q, tau, q_ref=recording.q_ref, name=recording.name))
         if not np.isfinite(seen[k]).all() or np.any(np.abs(tau) > 1.05 * limits.torque):
             continue

@@ -190,7 +190,7 @@ def sharpest(loop: ClosedLoop, recordings: Recordings) -> float:
     factor = 1.0
     for _ in range(_TIMES):
         sharper = factor / _SHARPER
-        values = {p.name: sharper * p.where(loop) for p in signs}
+        values = {p.name: sharper * float(p.where(loop)) for p in signs}
         if fastest_rate(loop.with_values(**values), recordings) * step > _STABLE:
             break
         factor = sharper
