@@ -344,3 +344,16 @@ def test_half_the_samples_know_half_as_much(case: Any) -> None:
     ratio = half.std / all_.std
     assert np.median(ratio) == pytest.approx(np.sqrt(2), rel=0.1)
     assert np.all((ratio > 1.1) & (ratio < 1.8))
+
+
+def test_recordings_without_torque_leave_no_inertia() -> None:
+    rng, time = np.random.default_rng(0), np.arange(0.0, 3.0, 0.005)
+    runs = []
+    for name in ("one", "two"):
+        q = 0.1 * np.sin(2 * np.pi * time[:, None] * rng.uniform(0.3, 1.0))
+        noise = 1e-9 * rng.standard_normal(q.shape)
+        runs.append(jaxid.Recording.from_arrays(time, q, noise, name=name))
+    tracking = jaxid.control.Tracking(cutoff=20.0)
+    loop = jaxid.ClosedLoop(jaxid.arms.Axis(M=5.0), tracking, name="axis")
+    with pytest.raises(FitError, match="axis has no inertia: check that tau is the recorded"):
+        jaxid.discover(loop, runs[:1], validate=runs[1:], progress=False)

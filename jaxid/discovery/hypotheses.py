@@ -14,7 +14,7 @@ from ..compiling import compiled
 from ..effects import AbstractEffect, Coulomb, Curve, Motion, Scene, check_declared
 from ..effects import catalogue as known
 from ..effects.curve import curve_over
-from ..errors import ModelError
+from ..errors import FitError, ModelError
 from ..parameters import Parameter, list_parameters
 from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
@@ -73,15 +73,13 @@ def survey(
     motion: Motion,
     tones: Sequence[Sequence[float]],
 ) -> Scene:
-    """Properties of the recordings and the nominal motion that screening uses."""
+    """Properties of the recordings and the nominal motion that screening uses.
+
+    **Raises:** `FitError` if the arm has no inertia.
+    """
     q = np.asarray(motion.q).reshape(-1, loop.joints)
     low, high = q.min(axis=0), q.max(axis=0)
     speed = np.abs(np.asarray(motion.v)).reshape(-1, loop.joints).max(axis=0)
-    # Always so many positions, for one program.
-    chosen = np.linspace(0, len(q) - 1, _POSITIONS).astype(int)
-    mass = np.asarray(_mass_matrices(loop.arm, jax.device_put(q[chosen])))
-    # Rotors are effects: without them a wrist with drawn bodies may have almost no inertia.
-    mass = mass + 1e-6 * np.trace(mass, axis1=1, axis2=2)[:, None, None] * np.eye(loop.joints)
     smoothed = {e.joint: float(e.smoothing) for e in loop.effects if isinstance(e, Coulomb)}
     return Scene(
         low,
@@ -89,7 +87,7 @@ def survey(
         np.maximum(high, low + 1e-6),
         np.maximum(speed, 1e-6),
         np.abs(np.asarray(motion.tau)).reshape(-1, loop.joints).max(axis=0),
-        1 / np.mean(np.diagonal(np.linalg.inv(mass), axis1=1, axis2=2), axis=0),
+        _inertia(loop, q),
         np.array([smoothed.get(j, 0.01) for j in range(1, loop.joints + 1)]),
         float(np.median([r.period for r in recordings])),
         float(max(r.duration for r in recordings)),
@@ -108,6 +106,23 @@ def survey(
 
 # Positions at which inertia is averaged.
 _POSITIONS = 64
+
+
+def _inertia(loop: ClosedLoop, q: Float[np.ndarray, "positions joints"]) -> Float[np.ndarray, "_"]:
+    """Inertia of each joint while the others are free to move, averaged over positions."""
+    # Always so many positions, for one program.
+    chosen = np.linspace(0, len(q) - 1, _POSITIONS).astype(int)
+    mass = np.asarray(_mass_matrices(loop.arm, jax.device_put(q[chosen])))
+    # Rotors are effects: without them a wrist with drawn bodies may have almost no inertia.
+    mass = mass + 1e-6 * np.trace(mass, axis1=1, axis2=2)[:, None, None] * np.eye(loop.joints)
+    try:
+        freed = np.linalg.inv(mass)
+    except np.linalg.LinAlgError as error:
+        raise FitError(
+            f"the fitted {loop.name} has no inertia: check that tau is the recorded torque, and "
+            "its unit"
+        ) from error
+    return 1 / np.mean(np.diagonal(freed, axis1=1, axis2=2), axis=0)
 
 
 @compiled
