@@ -12,7 +12,7 @@ from independent import effects as fx
 import jaxid
 from jaxid.discovery.asked import Asked
 from jaxid.discovery.search import Search
-from jaxid.discovery.story import Step
+from jaxid.discovery.step import Step
 from jaxid.effects import AbstractEffect, Motion, on_joint
 from jaxid.parameters import Scalar, parameter
 from jaxid.storage.campaign import Campaign

@@ -23,7 +23,8 @@ from .landscape import form
 from .models import Model, Named, named, probability, worth_keeping
 from .remarks import remarks
 from .search import Search
-from .story import Discovery, Step
+from .step import Step
+from .story import Discovery
 from .verdict import Outcome, misfit_of, refuted, risen, undecided
 
 _STOPPED = "it was interrupted before its end; resume=... goes on from saved steps"

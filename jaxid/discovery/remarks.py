@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from ..effects import ActuatorLag, TimeDelay
 from ..estimate import Fit
 from ..simulation.loop import ClosedLoop
-from .story import Step
+from .step import Step
 
 
 def remarks(steps: Sequence[Step], given: ClosedLoop) -> tuple[str, ...]:

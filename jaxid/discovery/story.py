@@ -4,7 +4,7 @@ import dataclasses
 import html
 import os
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +21,13 @@ from ..estimate.result import joint_columns
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from ..storage.saved import save
-from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
 from .effect_curves import EffectCurve, effect_curve
 from .floor import SPOKEN
-from .hypotheses import effect_on, on_recordings
+from .hypotheses import effect_on
 from .landscape import form
 from .models import Model, models_table, named, picked
+from .step import Step, added_in_words, errors_of, found_parameters, joint_errors, odds, step_name
 from .text import errors_table, models_lines, wrapped
 from .verdict import Outcome
 from .verify import Refits
@@ -39,23 +39,6 @@ if TYPE_CHECKING:
 
 # Models that a notebook shows.
 _SHOWN = 8
-
-
-class Step(eqx.Module):
-    """The model with one more of the added effects.
-
-    `diagnosis` exists if the search continued from this model, and for the first and last step.
-    `added` is the effect that this step adds to the previous one; `probability` is the weight of
-    all models with it; `alike` are effects that these recordings cannot distinguish from it.
-    """
-
-    label: str
-    fit: Fit
-    held_out: Comparison | None
-    diagnosis: Diagnosis | None
-    added: AbstractEffect | None = None
-    alike: tuple[tuple[str, int | None], ...] = ()
-    probability: float = 1.0
 
 
 class Discovery(AbstractShown):
@@ -105,7 +88,7 @@ class Discovery(AbstractShown):
     @property
     def sentence(self) -> str:
         """The verdict in a sentence for a colleague."""
-        added = _spoken(self.steps)
+        added = added_in_words(self.steps)
         if self.interrupted:
             so_far = f"adds {' and '.join(added)}" if added else "is the starting model"
             return f"The search was interrupted: the best model until then {so_far}."
@@ -154,10 +137,10 @@ class Discovery(AbstractShown):
         rows = []
         for step in self.steps:
             row: dict[str, Any] = {"step": step.label}
-            for j, x in enumerate(_rms(step.fit.error_percent), start=1):
+            for j, x in enumerate(joint_errors(step.fit.error_percent), start=1):
                 row[f"fit, joint {j}"] = x
             if step.held_out is not None:
-                for j, x in enumerate(_rms(step.held_out.error_percent), start=1):
+                for j, x in enumerate(joint_errors(step.held_out.error_percent), start=1):
                     row[f"held out, joint {j}"] = x
             rows.append(row)
         return pd.DataFrame(rows).set_index("step")
@@ -243,10 +226,14 @@ class Discovery(AbstractShown):
         """The error falling, step by step, with the noise floor."""
         from ..display import figures
 
-        series = {"fitted": np.stack([_rms(s.fit.error_percent) for s in self.steps])}
+        series = {"fitted": np.stack([joint_errors(s.fit.error_percent) for s in self.steps])}
         if all(s.held_out is not None for s in self.steps):
             series["held out"] = np.stack(
-                [_rms(s.held_out.error_percent) for s in self.steps if s.held_out is not None]
+                [
+                    joint_errors(s.held_out.error_percent)
+                    for s in self.steps
+                    if s.held_out is not None
+                ]
             )
         labels = [step.label for step in self.steps]
         return figures.error_falling(labels, series, self.noise_floor_percent())
@@ -324,7 +311,7 @@ class Discovery(AbstractShown):
                     "effect": step.added.effect_name(),
                     "joint": getattr(step.added, "joint", None),
                     "recordings": list(getattr(step.added, "recordings", ())),
-                    "parameters": _found_parameters(self.steps, k),
+                    "parameters": found_parameters(self.steps, k),
                     "probability": step.probability,
                     "indistinguishable": [{"effect": n, "joint": j} for n, j in step.alike],
                 }
@@ -332,7 +319,7 @@ class Discovery(AbstractShown):
                 if step.added is not None
             ],
             "depends_on": self.diagnosis.depends_on() if outside else [],
-            "error_percent": {"before": _errors(first), "after": _errors(last)},
+            "error_percent": {"before": errors_of(first), "after": errors_of(last)},
             "noise_floor_percent": self.noise_floor_percent().tolist(),
             "noise_floor_source": [list(s) for s in self.diagnosis.floor_sources()],
             "sentence": self.sentence,
@@ -344,9 +331,9 @@ class Discovery(AbstractShown):
 
     def __repr__(self) -> str:
         steps = [
-            (s.label, _rms(s.fit.error_percent).tolist(), None)
+            (s.label, joint_errors(s.fit.error_percent).tolist(), None)
             if s.held_out is None
-            else (s.label, *(_rms(x.error_percent).tolist() for x in (s.fit, s.held_out)))
+            else (s.label, *(joint_errors(x.error_percent).tolist() for x in (s.fit, s.held_out)))
             for s in self.steps
         ]
         lines = [
@@ -365,7 +352,7 @@ class Discovery(AbstractShown):
         """Each added effect with its probability, values, and indistinguishable alternatives."""
         lines = []
         for k, step in enumerate(s for s in self.steps if s.added is not None):
-            values = _found_parameters(self.steps, k)
+            values = found_parameters(self.steps, k)
             shown = ", ".join(
                 f"{n} {p['value']:.4g}"
                 + (f" ± {p['std']:.2g}" if p["std"] is not None else "")
@@ -392,80 +379,5 @@ class Discovery(AbstractShown):
         )
 
 
-def odds(share: float) -> str:
-    """A probability in words with few digits, such as `> 0.999`."""
-    if share < 0.001:
-        return "< 0.001"
-    return "> 0.999" if share > 0.999 else f"{share:.3g}"
-
-
 def _upper(sentence: str) -> str:
     return sentence[:1].upper() + sentence[1:]
-
-
-def _spoken(steps: Sequence[Step]) -> list[str]:
-    """Added effects in words with their probabilities; repeated effects are named once."""
-    added = [(step.added, step.probability) for step in steps if step.added is not None]
-    counted = Counter(_placed(e.spoken(), e) for e, _ in added)
-    sure = {_placed(e.spoken(), e): odds(share) for e, share in added}
-    often = {1: "", 2: " twice"}
-    return [
-        f"{name}{often.get(n, f' {n} times')} (probability {sure[name]})"
-        for name, n in counted.items()
-    ]
-
-
-def step_name(step: Step) -> str:
-    """The effect of a step by name and joint, with its recordings if it is not on all."""
-    assert step.added is not None
-    return _placed(step.added.effect_name(), step.added)
-
-
-def _placed(name: str, effect: AbstractEffect) -> str:
-    return effect_on(name, getattr(effect, "joint", None)) + on_recordings(effect)
-
-
-def _rms(table: "pd.DataFrame") -> Float[np.ndarray, " joints"]:
-    return over_recordings(table.to_numpy())
-
-
-def _errors(step: Step) -> dict[str, list[float]]:
-    errors = {"fit": _rms(step.fit.error_percent).tolist()}
-    if step.held_out is not None:
-        errors["validate"] = _rms(step.held_out.error_percent).tolist()
-    return errors
-
-
-def _found_parameters(steps: Sequence[Step], added: int) -> dict[str, dict[str, Any]]:
-    """Values of one of the added effects in the last fit; these are the loop's last effects."""
-    fit = steps[-1].fit
-    total = sum(step.added is not None for step in steps)
-    effect = fit.loop.effects[len(fit.loop.effects) - total + added]
-    std = fit.std
-    return {
-        name: {
-            "value": float(fit.theta[place]),
-            "std": float(std[place]) if np.isfinite(std[place]) else None,
-            "unit": unit,
-        }
-        for place, name, unit in effect_parameters(fit.loop, effect)
-    }
-
-
-def effect_parameters(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[int, str, str]]:
-    """Places of an effect's free values in `loop.theta`, with name in the effect and unit.
-
-    **Raises:** `ModelError` if the loop does not have the effect.
-    """
-    position = next((k for k, e in enumerate(loop.effects) if e is effect), None)
-    if position is None:
-        raise ModelError(f"{effect.effect_name()} is not one of the loop's effects: add it first")
-    found, place = [], 0
-    for p in loop.free_parameters:
-        steps = p.where.steps  # type: ignore[attr-defined]
-        if steps[:2] == ("effects", position):
-            for k in range(p.size):
-                name = steps[-1] if not p.several else f"{steps[-1]}[{k + 1}]"
-                found.append((place + k, str(name), loop.unit(p)))
-        place += p.size
-    return found

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..discovery import Comparison, Discovery, compare
-from ..discovery.story import Step
+from ..discovery.step import Step
 
 
 @dataclasses.dataclass(frozen=True)

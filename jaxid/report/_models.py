@@ -5,7 +5,7 @@ import numpy as np
 from ..discovery import Discovery
 from ..discovery.diagnosis import Diagnosis, Verdict
 from ..discovery.hypotheses import effect_on
-from ..discovery.story import Step, odds, step_name
+from ..discovery.step import Step, odds, step_name
 from ._html import Content, Markup, bar, cell, details, probability, section, table, tag
 
 SHOWN = 12

@@ -1,0 +1,114 @@
+"""The steps of a story: one more effect each, its errors, values and name in words."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..effects import AbstractEffect
+from ..errors import ModelError
+from ..estimate import Fit
+from ..simulation.loop import ClosedLoop
+from .comparison import Comparison
+from .diagnosis import Diagnosis, over_recordings
+from .hypotheses import effect_on, on_recordings
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class Step(eqx.Module):
+    """The model with one more of the added effects.
+
+    `diagnosis` exists if the search continued from this model, and for the first and last step.
+    `added` is the effect that this step adds to the previous one; `probability` is the weight of
+    all models with it; `alike` are effects that these recordings cannot distinguish from it.
+    """
+
+    label: str
+    fit: Fit
+    held_out: Comparison | None
+    diagnosis: Diagnosis | None
+    added: AbstractEffect | None = None
+    alike: tuple[tuple[str, int | None], ...] = ()
+    probability: float = 1.0
+
+
+def odds(share: float) -> str:
+    """A probability in words with few digits, such as `> 0.999`."""
+    if share < 0.001:
+        return "< 0.001"
+    return "> 0.999" if share > 0.999 else f"{share:.3g}"
+
+
+def added_in_words(steps: Sequence[Step]) -> list[str]:
+    """Added effects in words with their probabilities; repeated effects are named once."""
+    added = [(step.added, step.probability) for step in steps if step.added is not None]
+    counted = Counter(_placed(e.spoken(), e) for e, _ in added)
+    sure = {_placed(e.spoken(), e): odds(share) for e, share in added}
+    often = {1: "", 2: " twice"}
+    return [
+        f"{name}{often.get(n, f' {n} times')} (probability {sure[name]})"
+        for name, n in counted.items()
+    ]
+
+
+def step_name(step: Step) -> str:
+    """The effect of a step by name and joint, with its recordings if it is not on all."""
+    assert step.added is not None
+    return _placed(step.added.effect_name(), step.added)
+
+
+def _placed(name: str, effect: AbstractEffect) -> str:
+    return effect_on(name, getattr(effect, "joint", None)) + on_recordings(effect)
+
+
+def joint_errors(table: "pd.DataFrame") -> Float[np.ndarray, " joints"]:
+    """Errors by joint, %, over the recordings of a table of errors."""
+    return over_recordings(table.to_numpy())
+
+
+def errors_of(step: Step) -> dict[str, list[float]]:
+    """Errors by joint, %, on fitted (`fit`) and held-out recordings (`validate`)."""
+    errors = {"fit": joint_errors(step.fit.error_percent).tolist()}
+    if step.held_out is not None:
+        errors["validate"] = joint_errors(step.held_out.error_percent).tolist()
+    return errors
+
+
+def found_parameters(steps: Sequence[Step], added: int) -> dict[str, dict[str, Any]]:
+    """Values of one of the added effects in the last fit; these are the loop's last effects."""
+    fit = steps[-1].fit
+    total = sum(step.added is not None for step in steps)
+    effect = fit.loop.effects[len(fit.loop.effects) - total + added]
+    std = fit.std
+    return {
+        name: {
+            "value": float(fit.theta[place]),
+            "std": float(std[place]) if np.isfinite(std[place]) else None,
+            "unit": unit,
+        }
+        for place, name, unit in effect_parameters(fit.loop, effect)
+    }
+
+
+def effect_parameters(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[int, str, str]]:
+    """Places of an effect's free values in `loop.theta`, with name in the effect and unit.
+
+    **Raises:** `ModelError` if the loop does not have the effect.
+    """
+    position = next((k for k, e in enumerate(loop.effects) if e is effect), None)
+    if position is None:
+        raise ModelError(f"{effect.effect_name()} is not one of the loop's effects: add it first")
+    found, place = [], 0
+    for p in loop.free_parameters:
+        steps = p.where.steps  # type: ignore[attr-defined]
+        if steps[:2] == ("effects", position):
+            for k in range(p.size):
+                name = steps[-1] if not p.several else f"{steps[-1]}[{k + 1}]"
+                found.append((place + k, str(name), loop.unit(p)))
+        place += p.size
+    return found
