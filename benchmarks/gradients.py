@@ -25,9 +25,9 @@ from jaxtyping import Array, Float
 import jaxid
 from jaxid.estimate.minimise import point_around
 from jaxid.simulation.batch import Interval, prepare
-from jaxid.simulation.dynamics import unflatten
 from jaxid.simulation.integration import initial, instant_at
 from jaxid.simulation.runs import each, run
+from jaxid.simulation.state import unflatten
 from jaxid.simulation.stepping import RK4
 from jaxid.simulation.unrolling import unrolled
 

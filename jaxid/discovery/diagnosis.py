@@ -3,7 +3,6 @@
 import dataclasses
 import html
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ from jaxtyping import Float
 
 from ..display.shown import AbstractShown
 from ..effects import AbstractEffect, Curve, Motion, Scene
+from ..effects.curve import coordinate_unit
 from ..errors import FitError
 from ..estimate import Fit
 from ..noise import ARFilter
@@ -382,15 +382,6 @@ class Diagnosis(AbstractShown):
 def _label(verdict: Verdict) -> str:
     joint = verdict.hypothesis.joint
     return verdict.hypothesis.name + ("" if joint is None else f", joint {joint}")
-
-
-def coordinate_unit(curve: Curve, torque: Sequence[str], position: Sequence[str]) -> str:
-    """The unit of a curve's coordinate, from the units of each joint's torque and position."""
-    if curve.coordinate == "t":
-        return "s"
-    if curve.coordinate == "tau":
-        return torque[curve.of - 1]
-    return position[curve.of - 1] + {"v": "/s", "a": "/s²"}.get(curve.coordinate, "")
 
 
 def share_left(

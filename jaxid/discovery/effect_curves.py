@@ -13,12 +13,12 @@ from jaxtyping import Float
 
 from ..display.shown import AbstractShown
 from ..effects import AbstractEffect, AbstractTransmission, Curve, Motion, recording_label
+from ..effects.curve import coordinate_unit
 from ..errors import ModelError
 from ..estimate import Fit
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from .comparison import Comparison, compare
-from .diagnosis import coordinate_unit
 from .hypotheses import effect_on
 from .signatures import Placed, force_and_slopes, left_for_links
 

@@ -12,11 +12,12 @@ from jaxtyping import Array, Float
 from ..compiling import compiled
 from ..effects import AbstractTransmission, Motion
 from ..simulation.batch import Batch, Interval
-from ..simulation.dynamics import link_load, unflatten
+from ..simulation.dynamics import link_load
 from ..simulation.integration import SIGNALS, initial
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import advance, at_points, each, run
 from ..simulation.sharing import one_by_one
+from ..simulation.state import unflatten
 from ..simulation.steps import with_forward_mode, with_rolled_stages
 
 Place = Literal["push", "noise", "rate", "pull"]

@@ -1,5 +1,6 @@
 """A free-form spline of one coordinate, which assumes no physical formula."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
@@ -78,3 +79,12 @@ def curve_over(values: Float[np.ndarray, " samples"]) -> tuple[float, float]:
     low, high = np.quantile(values, [0.001, 0.999])
     width = max(float(high - low), 1e-9)
     return float(low) - 1e-3 * width, float(high) + 1e-3 * width
+
+
+def coordinate_unit(curve: Curve, torque: Sequence[str], position: Sequence[str]) -> str:
+    """The unit of a curve's coordinate, from the units of each joint's torque and position."""
+    if curve.coordinate == "t":
+        return "s"
+    if curve.coordinate == "tau":
+        return torque[curve.of - 1]
+    return position[curve.of - 1] + {"v": "/s", "a": "/s²"}.get(curve.coordinate, "")

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..discovery import Comparison
-from ..discovery.diagnosis import Verdict, coordinate_unit
+from ..discovery.diagnosis import Verdict
 from ..discovery.score import whitened
 from ..display import figures
 from ..effects import Curve
+from ..effects.curve import coordinate_unit
 from ..noise import autocorrelation
 from ._beside import Beside
 from ._html import Content, Markup, cell, figure, join, section, table, tag

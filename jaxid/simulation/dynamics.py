@@ -1,90 +1,16 @@
-"""The equations of motion of a closed loop, and its state."""
+"""The equations of motion of a closed loop."""
 
 import dataclasses
-import math
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from ..control import Reading, Reference
 from ..effects import AbstractEffect, AbstractTransmission, DriveGain, Motion
 from .loop import ClosedLoop
-
-
-class State(eqx.Module):
-    """The loop's state: drive positions and velocities, the effects' states, the controller's."""
-
-    q: Float[Array, " joints"]
-    v: Float[Array, " joints"]
-    effects: tuple[Float[Array, " _"], ...]
-    controller: Float[Array, " states"]
-
-
-def rest(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> State:
-    """The state at a position and velocity, `(joints,)`, with all else at rest."""
-    effects = tuple(effect.initial_state() for effect in loop.effects)
-    return State(q, v, effects, loop.controller.initial_state(read(loop, q, v)))
-
-
-def settle(
-    loop: ClosedLoop,
-    t: Float[Array, ""],
-    state: State,
-    reference: Reference,
-    label: Int[Array, ""],
-) -> State:
-    """The state with the effects' own states in equilibrium at the first command."""
-    seen = read(loop, state.q, state.v)
-    mass = loop.arm.mass_matrix(state.q)
-    tau = loop.controller.command(seen, reference, state.controller, mass)
-    still, none = jnp.zeros_like(state.q), jnp.zeros(0)
-    motion = Motion(t, state.q, state.v, still, tau, none, label, reference.held)
-    settled = []
-    for effect in loop.effects:
-        own = effect.settled(motion)
-        settled.append(own)
-        motion = dataclasses.replace(
-            motion, tau=effect.command(dataclasses.replace(motion, state=own))
-        )
-    return dataclasses.replace(state, effects=tuple(settled))
-
-
-def _sensor(loop: ClosedLoop, q: Float[Array, " joints"]) -> Float[Array, " joints"]:
-    """Reading of sensors with infinite resolution, `(joints,)`."""
-    for effect in loop.effects:
-        q = effect.read(q)
-    return q
-
-
-def read(loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]) -> Reading:
-    """Sensor readings at a position and velocity, `(joints,)`."""
-    seen, rate = jax.jvp(lambda position: _sensor(loop, position), (q,), (v,))
-    if loop.resolution is not None:
-        step = jnp.asarray(loop.resolution)
-        # Rounding has zero derivative; sensitivities are those of an ideal encoder.
-        seen = seen + jax.lax.stop_gradient(step * jnp.round(seen / step) - seen)
-    return Reading(seen, rate)
-
-
-def behind(
-    loop: ClosedLoop, q: Float[Array, " joints"], v: Float[Array, " joints"]
-) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
-    """Position and velocity at which the sensors give these readings, `(joints,)` each."""
-    if all(type(effect).read is AbstractEffect.read for effect in loop.effects):
-        return q, v
-
-    def position(reading: Float[Array, " joints"]) -> Float[Array, " joints"]:
-        guess = reading
-        # Sensor errors are some hundredths of the reading, so each iteration gains two digits.
-        for _ in range(6):
-            guess = guess + reading - _sensor(loop, guess)
-        return guess
-
-    return jax.jvp(position, (q,), (v,))
+from .state import State, behind, read
 
 
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -412,16 +338,3 @@ def _through_transmissions(
         a = a.at[j].set(jnp.where(there, turned, link[j]))
         twisting[k] = jnp.where(there, link[j] - turned, 0.0)
     return a, twisting
-
-
-def sizes(loop: ClosedLoop) -> list[int]:
-    """Lengths of the parts of a state: q, v, each effect's, the controller's."""
-    zeros = jnp.zeros(loop.joints)
-    parts = jax.eval_shape(lambda: rest(loop, zeros, zeros))
-    return [math.prod(leaf.shape) for leaf in jax.tree.leaves(parts)]
-
-
-def unflatten(loop: ClosedLoop) -> Callable[[Float[Array, " states"]], State]:
-    """The function that converts a flat vector, `(states,)`, to a state."""
-    zeros = jnp.zeros(loop.joints)
-    return ravel_pytree(rest(loop, zeros, zeros))[1]

@@ -30,18 +30,9 @@ from .by_interval import (
     one_of,
     together,
 )
-from .dynamics import (
-    Instant,
-    Outside,
-    State,
-    behind,
-    imposed,
-    instant,
-    rest,
-    settle,
-    unflatten,
-)
+from .dynamics import Instant, Outside, imposed, instant
 from .loop import ClosedLoop
+from .state import State, behind, rest, settle, unflatten
 from .stepping import ready
 from .unrolling import unrolled
 

@@ -17,9 +17,10 @@ from ..effects import NOBODY
 from ..errors import JaxidWarning, ModelError
 from ..recording import Recordings
 from .batch import check_joints, held_at, held_names
-from .dynamics import Outside, instant, rest, unflatten
+from .dynamics import Outside, instant
 from .integration import given
 from .loop import ClosedLoop
+from .state import rest, unflatten
 from .stepping import RK4
 
 # Steps between two samples above which a simulation is reported as slow, and is refused.

@@ -12,18 +12,13 @@ from functools import partial, reduce
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from .decompositions import decomposed
 from .kernels import plain_product, say_what_splits, summed_product
 from .moves import MOVES
-
-# Arrays above these sizes are not unrolled: unrolling a spline's dozen knots would only make
-# programs long. Arrays with two or more axes belong to a few joints and their derivatives.
-WHOLE, WHOLE_MATRIX = 9, 36
+from .values import Fixed, Value
 
 ELEMENTWISE = frozenset(
     """
@@ -54,78 +49,19 @@ def unrolled(fun: Callable[..., Any], *like: Any) -> Callable[..., Any]:
     """
     closed, shape = jax.make_jaxpr(fun, return_shape=True)(*like)
     structure = jax.tree.structure(shape)
-    consts = [_Value.constant(c) for c in closed.consts]
+    consts = [Value.constant(c) for c in closed.consts]
     for const in consts:
         # Done here, because the first use may be inside a loop.
         const.scalars() if const.small else const.whole()
 
     def evaluate(*args: Any) -> Any:
-        inputs = [_Value.of(leaf) for leaf in jax.tree.leaves(args)]
+        inputs = [Value.of(leaf) for leaf in jax.tree.leaves(args)]
         outputs = _Writer().run(closed.jaxpr, consts, inputs)
         return jax.tree.unflatten(structure, [value.whole() for value in outputs])
 
     # A separate jitted function: the stages of a step share one trace of it, which is batched and
     # differentiated once. XLA inlines the calls.
     return jax.jit(evaluate)
-
-
-class _Value:
-    """An array as one tracer, as an object array of scalars, or both if both were needed."""
-
-    def __init__(self, shape, dtype, array=None, scalars=None):
-        self.shape, self.dtype = tuple(shape), dtype
-        self._array: Any = array
-        self._scalars: Any = scalars
-
-    @classmethod
-    def of(cls, array) -> "_Value":
-        if not isinstance(array, Tracer):
-            array = np.asarray(array)
-        return cls(np.shape(array), jnp.result_type(array), array=array)
-
-    def whole(self):
-        if self._array is None:
-            flat = [jnp.asarray(x, self.dtype) for x in self._scalars.ravel()]
-            if self.shape == ():
-                self._array = flat[0]
-            elif not flat:
-                self._array = jnp.zeros(self.shape, self.dtype)
-            else:
-                self._array = jnp.stack(flat).reshape(self.shape)
-        return self._array
-
-    def scalars(self) -> np.ndarray:
-        if self._scalars is None:
-            self._scalars = np.empty(self.shape, object)
-            for at in np.ndindex(self.shape):
-                self._scalars[at] = self._array[at]
-        return self._scalars
-
-    @classmethod
-    def constant(cls, array) -> "_Value":
-        """Of an array that the function refers to; its numbers are `_Fixed` if they are known."""
-        value = cls.of(array)
-        if isinstance(value._array, np.ndarray) and value.dtype == float and value.small:
-            value._scalars = np.empty(value.shape, object)
-            for at in np.ndindex(value.shape):
-                value._scalars[at] = _Fixed(value._array[at])
-        return value
-
-    @classmethod
-    def like(cls, aval) -> "_Value":
-        return cls(aval.shape, aval.dtype)
-
-    @property
-    def small(self) -> bool:
-        return math.prod(self.shape) <= (WHOLE if len(self.shape) < 2 else WHOLE_MATRIX)
-
-    @property
-    def written_out(self) -> bool:
-        return self.small or self._scalars is not None
-
-
-class _Fixed(np.float64):
-    """A number that follows from constant arrays alone, such as the frames of an arm."""
 
 
 def _known(x) -> bool:
@@ -143,7 +79,7 @@ def _same(name: str, args: list[Any]):
     if len(args) != 2:
         return None
     if name == "mul":
-        zero = next((x for x in args if isinstance(x, _Fixed) and x == 0), None)
+        zero = next((x for x in args if isinstance(x, Fixed) and x == 0), None)
         if zero is not None:
             return zero
     for a, known in (args, args[::-1]):
@@ -153,7 +89,7 @@ def _same(name: str, args: list[Any]):
     return None
 
 
-def _as_it_is(eqn, inputs: list[_Value], origin) -> list[_Value]:
+def _as_it_is(eqn, inputs: list[Value], origin) -> list[Value]:
     """One equation, part of the outermost one `origin`, evaluated with whole arrays."""
     whole = [v.whole() for v in inputs]
     out = summed_product(eqn, whole) or decomposed(eqn, whole)
@@ -161,7 +97,7 @@ def _as_it_is(eqn, inputs: list[_Value], origin) -> list[_Value]:
         say_what_splits(eqn, origin)
         out = _bound(eqn, whole, origin)
     shapes = [v.aval for v in eqn.outvars]
-    return [_Value(s.shape, s.dtype, array=o) for s, o in zip(shapes, out, strict=True)]
+    return [Value(s.shape, s.dtype, array=o) for s, o in zip(shapes, out, strict=True)]
 
 
 def _bound(eqn, whole: list[Any], origin) -> Sequence[Any]:
@@ -183,8 +119,8 @@ def _with_solver_written_out(params: dict[str, Any], origin) -> dict[str, Any]:
 
     def written(closed: ClosedJaxpr) -> ClosedJaxpr:
         def evaluate(*args):
-            consts = [_Value.of(c) for c in closed.consts]
-            found = _Writer(origin).run(closed.jaxpr, consts, [_Value.of(a) for a in args])
+            consts = [Value.of(c) for c in closed.consts]
+            found = _Writer(origin).run(closed.jaxpr, consts, [Value.of(a) for a in args])
             return [value.whole() for value in found]
 
         return jax.make_jaxpr(evaluate)(*closed.in_avals)
@@ -204,13 +140,13 @@ class _Writer:
         # The equation that is being evaluated; the outermost one if equations are nested.
         self.origin = origin
 
-    def run(self, jaxpr: Jaxpr, consts: list[_Value], args: list[_Value]) -> list[_Value]:
-        values: dict[Any, _Value] = {}
+    def run(self, jaxpr: Jaxpr, consts: list[Value], args: list[Value]) -> list[Value]:
+        values: dict[Any, Value] = {}
 
-        def look_up(atom) -> _Value:
+        def look_up(atom) -> Value:
             if isinstance(atom, Literal):
                 kind: Any = atom.aval
-                return _Value(kind.shape, kind.dtype, np.asarray(atom.val, kind.dtype))
+                return Value(kind.shape, kind.dtype, np.asarray(atom.val, kind.dtype))
             return values[atom]
 
         values.update(zip(jaxpr.constvars, consts, strict=True))
@@ -220,7 +156,7 @@ class _Writer:
             values.update(zip(eqn.outvars, self.equation(eqn, inputs), strict=True))
         return [look_up(atom) for atom in jaxpr.outvars]
 
-    def equation(self, eqn, inputs: list[_Value]) -> list[_Value]:
+    def equation(self, eqn, inputs: list[Value]) -> list[Value]:
         name = eqn.primitive.name
         if name in INLINED:
             inner = eqn.params[INLINED[name]]
@@ -228,24 +164,24 @@ class _Writer:
                 return self.inlined(eqn, inner, inputs)
         shapes = [v.aval for v in eqn.outvars]
         moved = name in MOVES and all(v.written_out for v in inputs)
-        if moved or all(v.small for v in [*inputs, *map(_Value.like, shapes)]):
+        if moved or all(v.small for v in [*inputs, *map(Value.like, shapes)]):
             written = self.written(eqn, name, inputs)
             if written is not None:
                 pieces = [written] if not eqn.primitive.multiple_results else written
                 return [
-                    _Value(s.shape, s.dtype, scalars=w.reshape(s.shape))
+                    Value(s.shape, s.dtype, scalars=w.reshape(s.shape))
                     for s, w in zip(shapes, pieces, strict=True)
                 ]
         return _as_it_is(eqn, inputs, self.origin or eqn)
 
-    def inlined(self, eqn, inner: ClosedJaxpr, inputs: list[_Value]) -> list[_Value]:
+    def inlined(self, eqn, inner: ClosedJaxpr, inputs: list[Value]) -> list[Value]:
         """A separately traced function, inlined at its call."""
         before, self.origin = self.origin, self.origin or eqn
-        found = self.run(inner.jaxpr, [_Value.of(c) for c in inner.consts], inputs)
+        found = self.run(inner.jaxpr, [Value.of(c) for c in inner.consts], inputs)
         self.origin = before
         return found
 
-    def written(self, eqn, name: str, inputs: list[_Value]):
+    def written(self, eqn, name: str, inputs: list[Value]):
         """The scalars of an equation's result; None if it cannot be unrolled."""
         p = eqn.params
         if name in ELEMENTWISE:
@@ -262,7 +198,7 @@ class _Writer:
             shape = [1] * len(p["shape"])
             shape[p["dimension"]] = -1
             count = np.arange(p["shape"][p["dimension"]]).astype(p["dtype"])
-            return _Value.of(np.broadcast_to(count.reshape(shape), p["shape"])).scalars()
+            return Value.of(np.broadcast_to(count.reshape(shape), p["shape"])).scalars()
         if name in ("scatter", "scatter-add", "scatter-mul"):
             return self.scattered(name, p, *inputs)
         return None
@@ -283,8 +219,8 @@ class _Writer:
             if name in ARITHMETIC:
                 with np.errstate(all="ignore"):
                     found = ARITHMETIC[name](*args)
-                fixed = any(isinstance(a, _Fixed) for a in args) and found.dtype == float
-                return _Fixed(found) if fixed else found
+                fixed = any(isinstance(a, Fixed) for a in args) and found.dtype == float
+                return Fixed(found) if fixed else found
             # XLA decides how numbers outside an integer type's range are converted.
             if name == "convert_element_type" and not (
                 args[0].dtype.kind == "f" and np.dtype(params["new_dtype"]).kind in "iu"
@@ -314,7 +250,7 @@ class _Writer:
         """The sum of zero and the terms, added from first to last."""
         return reduce(self.plus, terms, np.zeros((), dtype)[()])
 
-    def converted(self, value: _Value, dtype) -> np.ndarray:
+    def converted(self, value: Value, dtype) -> np.ndarray:
         """The scalars of a value in another type."""
         if value.dtype == dtype:
             return value.scalars()
@@ -325,7 +261,7 @@ class _Writer:
             out[at] = self.once("convert_element_type", params, [value.scalars()[at]], evaluate)
         return out
 
-    def product(self, p, left: _Value, right: _Value):
+    def product(self, p, left: Value, right: Value):
         (contract_left, contract_right), (batch_left, batch_right) = p["dimension_numbers"]
         wanted = np.dtype(p["preferred_element_type"] or left.dtype)
         if left.dtype != right.dtype or not plain_product(p, left.dtype):
@@ -345,7 +281,7 @@ class _Writer:
             out[n, i, j] = self.added(terms, wanted)
         return out.reshape(several + rows + columns)
 
-    def running(self, p, value: _Value):
+    def running(self, p, value: Value):
         array = np.moveaxis(value.scalars(), p["axis"], 0)
         array = array[::-1] if p["reverse"] else array
         out = np.empty(array.shape, object)
@@ -353,7 +289,7 @@ class _Writer:
             out[at] = self.plus(out[at[0] - 1, *at[1:]], array[at]) if at[0] else array[at]
         return np.moveaxis(out[::-1] if p["reverse"] else out, 0, p["axis"])
 
-    def total(self, p, value: _Value):
+    def total(self, p, value: Value):
         array = value.scalars()
         axes = tuple(p["axes"])
         moved = np.moveaxis(array, axes, range(len(axes)))
@@ -364,7 +300,7 @@ class _Writer:
             out[to] = self.added(terms, value.dtype)
         return out
 
-    def scattered(self, name, p, operand: _Value, indices: _Value, updates: _Value):
+    def scattered(self, name, p, operand: Value, indices: Value, updates: Value):
         """Elements set, added to or multiplied: one, or all with one index along an axis.
 
         Indices must be known when the program is made.
