@@ -115,7 +115,7 @@ def test_torque_and_motion_apart_in_time_are_named_with_the_delay(found):
         diagnosis, data=dataclasses.replace(diagnosis.data, residual=residual)
     )
     said = refuted(fit, diagnosis.noise, shifted, None, WORTH)
-    assert "what is left of joint 2" in said
+    assert "the residual of joint 2" in said
     delay = float(said.split("Tracking(delay=")[1].split(")")[0])
     assert delay == pytest.approx(late, rel=0.1)
 
