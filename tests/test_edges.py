@@ -225,7 +225,7 @@ def test_its_own_simulation_is_fitted_to_rounding(case: Any, plain: jaxid.Fit) -
     assert fit.succeeded
     sound(fit)
     assert np.abs(fit.theta / np.asarray(loop.theta) - 1).max() < 1e-6
-    with pytest.raises(FitError, match="nothing to diagnose"):
+    with pytest.raises(FitError, match="a diagnosis is not possible"):
         jaxid.diagnose(fit, progress=False)
 
 

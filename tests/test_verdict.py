@@ -86,7 +86,7 @@ def test_what_noise_does_not_account_for_is_no_verdict(found):
 def test_a_start_that_shares_the_weight_is_undecided():
     start, rival = Model((), 100.0), Model((TorqueOffset(joint=2),), 98.0)
     models = [dataclasses.replace(rival, weight=0.73), dataclasses.replace(start, weight=0.27)]
-    assert "only 2 behind" in undecided(models, rival)
+    assert "only 2 larger" in undecided(models, rival)
     sure = dataclasses.replace(rival, score=90.0)
     assert undecided([sure, start], sure) == ""
     alone = [dataclasses.replace(start, weight=0.9), dataclasses.replace(rival, weight=0.1)]
@@ -115,7 +115,7 @@ def test_torque_and_motion_apart_in_time_are_named_with_the_delay(found):
         diagnosis, data=dataclasses.replace(diagnosis.data, residual=residual)
     )
     said = refuted(fit, diagnosis.noise, shifted, None, WORTH)
-    assert "what is left of joint 2" in said
+    assert "the residual of joint 2" in said
     delay = float(said.split("Tracking(delay=")[1].split(")")[0])
     assert delay == pytest.approx(late, rel=0.1)
 

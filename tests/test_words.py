@@ -16,7 +16,6 @@ PHRASES = {
     r"say nothing of (motions|what)": "is valid for the recorded motions only",
     r"who is killed|goes on where it was": "a killed run can continue",
     r"through the same door|[Tt]he one door": "is a method of",
-    r"\bheld against (the|a)\b": "compared with",
     r"next to nothing": "almost nothing",
     r"so many \w+ more\b": "additional",
     r"eat the physics": "absorb a missing effect",
@@ -56,25 +55,15 @@ PHRASES = {
     r"\bworth asking\b|\bto be asked\b": "to screen",
     r"\bsays? nothing\b|\bsay something\b": "has no information",
     r"\bwhat (there )?is there\b": "the existing",
-}
-# Modules that have not been rewritten yet.
-LATER = {
-    f"discovery/{name}"
-    for name in (
-        "_discover",
-        "explore",
-        "finite",
-        "likelihood",
-        "predict",
-        "ranking",
-        "release",
-        "screening",
-        "search",
-        "support",
-        "system",
-        "verdict",
-        "verify",
-    )
+    r"\bheld against\b": "compared with",
+    r"\bworth knowing\b": "relevant",
+    r"\b(is|are) worth trying\b|\bvalues worth trying\b": "to try",
+    r"\bas (was )?(told|asked)\b": "at the limit",
+    r"\b(takes?|took|taken) for noise\b": "models as noise",
+    r"\bare parted\b|\bpart drive and link\b": "are separated by a transmission",
+    r"\b(a joint|it|the model) leaves \{": "the error of ... is",
+    r"\bat the most\b": "largest number of",
+    r"\bone an? (output|joint|recording)\b": "one per",
 }
 
 
@@ -97,11 +86,10 @@ def spoken(source: str) -> str:
 
 
 def modules() -> dict[str, str]:
-    """Comments and strings of the modules that have been rewritten."""
+    """Comments and strings of the modules."""
     package = ROOT / "jaxid"
     paths = [p.relative_to(package) for p in sorted(package.rglob("*.py"))]
-    kept = [p for p in paths if p.with_suffix("").as_posix() not in LATER]
-    return {str(p): spoken((package / p).read_text("utf-8")) for p in kept}
+    return {str(p): spoken((package / p).read_text("utf-8")) for p in paths}
 
 
 def benchmarks() -> dict[str, str]:

@@ -104,7 +104,7 @@ class AbstractArm(eqx.Module):
     def in_space(self) -> InSpace | None:
         """Its joints and bodies in space, None if not known.
 
-        They allow effects in space: a base that is not level, and payloads.
+        They allow effects on spatial arms: a base that is not level, and payloads.
         """
         return None
 

@@ -1,4 +1,4 @@
-"""A serial arm in space with any number of joints, in base parameters."""
+"""A serial spatial arm with any number of joints, in base parameters."""
 
 import os
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Where the model fails and what is missing: compare, diagnose, discover."""
+"""Comparison, diagnosis and discovery: where a model is wrong, and which effect it lacks."""
 
 from ._discover import discover as discover
 from .comparison import Comparison as Comparison

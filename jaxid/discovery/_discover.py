@@ -1,4 +1,4 @@
-"""`discover`: the search, its validation on held-out recordings, and its report."""
+"""`discover`: the search, the tests of the final model, and the result."""
 
 import dataclasses
 import itertools
@@ -27,8 +27,8 @@ from .step import Step
 from .story import Discovery
 from .verdict import Outcome, misfit_of, refuted, risen, undecided
 
-_STOPPED = "it was interrupted before its end; resume=... goes on from saved steps"
-# Smallest weight of a rival whose error on held-out recordings is simulated.
+_STOPPED = "the search was interrupted; resume=... continues it from its saved steps"
+# Smallest weight of a model whose error on held-out recordings is computed.
 _SHOWN = 0.01
 
 
@@ -45,39 +45,42 @@ def discover(
     resume: str | Path | None = None,
     progress: bool = True,
 ) -> Discovery:
-    """Finds the effects that the model lacks: the set of effects with the best score.
+    """Searches the catalogue for the set of effects with the lowest score.
 
-    Sets are predicted in the system linearised along the fitted runs, and the best few are fitted
-    in full. The system is then linearised again at the best fit. This is repeated until no
-    predicted set is better.
+    Sets of effects are predicted in the system that is linearised along the fitted runs. The best
+    few are fitted in full. The system is then linearised again at the best fit, until no predicted
+    set has a lower score.
 
     **Arguments:**
 
     - `loop`: the starting model.
-    - `recordings`: recordings to fit. `validate`: held-out recordings; they enter no score.
+    - `recordings`: recordings to fit. All recordings have one sample rate.
+    - `validate`: held-out recordings. They do not enter the score; they test the final model. If
+      None, the model is tested on the fitted recordings only.
     - `catalogue`: as for `diagnose`.
-    - `method`: method of the fits.
+    - `method`: settings of the fits, an `OEM`; by default `OEM()`.
     - `significance`: corrected p-value below which a diagnosis reports a missing effect.
-    - `worth`: smallest relevant effect: it must change some joint's torque by this share, %.
+    - `worth`: smallest relevant change of a joint's torque, in % of its norm. An effect that
+      changes the torque of every joint by less is not added.
     - `most`: largest number of effects to add.
     - `resume`: folder in which every fit is saved as it ends, and from which the same call
       continues; it is created if it does not exist.
-    - `progress`: whether to show the set being tried and the remaining time, and in a notebook
+    - `progress`: whether to show the set that is tried and the remaining time, and in a notebook
       also the error of each model.
 
-    Ctrl-C ends the search. If a fit exists by then, the best model so far is returned
-    (`interrupted`).
+    Ctrl-C ends the search. If the starting model has been fitted by then, the result is the best
+    fitted model, with `interrupted` set and the verdict `undetermined`.
 
-    **Raises:** `FitError`, `ModelError`, `RecordingError` if model and recordings do not match;
-    also if the recordings were sampled at different rates; `SaveError` if the folder holds steps
-    of another call.
+    **Raises:** `FitError`, `ModelError` or `RecordingError` if model and recordings do not match;
+    `RecordingError` if the recordings have different sample rates, or if a held-out recording is
+    also fitted; `SaveError` if the folder contains steps of another call.
     """
     started = time.perf_counter()
     judged = loop.controller.judged
     if method is not None and method.output not in (None, judged):
         raise FitError(
-            f"a discovery compares {judged}, by which {loop.name} is judged, and not "
-            f"OEM(output={method.output!r}): leave out output"
+            f"a discovery on {loop.name} compares {judged}; OEM(output={method.output!r}) is not "
+            "supported: leave out output"
         )
     recordings = Recordings.of(recordings)
     held_out = None if validate is None else Recordings.of(validate)
@@ -105,7 +108,7 @@ def discover(
 def _told(
     search: Search, verdict: Outcome, unfinished: bool, started: float, interrupted: bool = False
 ) -> Discovery:
-    """The result, step by step, with errors on held-out recordings."""
+    """The result of a search, with errors on held-out recordings."""
     models = search.visited.weighed(search.at)
     steps = _steps(search, models)
     models = _held_out(search, models, steps)
@@ -114,7 +117,7 @@ def _told(
         reason = _doubt(search, verdict, steps, models)
     notes = (*remarks(steps, search.given), *search.failures)
     if unfinished:
-        notes = (f"stopped after {search.asked.most} effects, as told: raise most", *notes)
+        notes = (f"stopped at the limit of {search.asked.most} effects: raise most", *notes)
     return Discovery(
         verdict="undetermined" if reason else verdict,
         reason=reason,
@@ -132,7 +135,7 @@ def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step], models: Sequ
     """Why the verdict is undetermined; empty if it is not."""
     first, last = steps[0], steps[-1]
     if verdict == "outside_catalogue":
-        # A curve may absorb the residual of a model that explains almost nothing.
+        # A curve can absorb the residual of a model that explains almost nothing.
         blind = last.fit.status is Status.misfit and last.fit.error_percent.min(axis=None) > 99
         return misfit_of(last.fit) if blind else ""
     both = None
@@ -145,7 +148,7 @@ def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step], models: Sequ
 
 
 def _raised(search: Search, steps: Sequence[Step]) -> str:
-    """A sentence on effects that raised the error on held-out recordings; empty if none did."""
+    """A reason that names the effects that raised the held-out error; empty if none did."""
     seen = [(s.label, s.held_out) for s in steps if s.held_out is not None]
     noise = search.at.noise
     if len(seen) < 2 or not (reason := risen(seen[0][1], seen[-1][1], noise)):
@@ -157,7 +160,7 @@ def _raised(search: Search, steps: Sequence[Step]) -> str:
 
 
 def _held_out(search: Search, models: Sequence[Model], steps: Sequence[Step]) -> tuple[Model, ...]:
-    """Models with their error on held-out recordings, simulated if their weight is large enough."""
+    """Models with their error on held-out recordings, computed if their weight is large enough."""
     known = {id(s.fit): s.held_out for s in steps}
     held_out = search.asked.held_out
     found = []
@@ -171,7 +174,7 @@ def _held_out(search: Search, models: Sequence[Model], steps: Sequence[Step]) ->
 
 
 def _steps(search: Search, weighed: Sequence[Model]) -> list[Step]:
-    """The starting model, followed by one more effect per step."""
+    """The starting model, followed by one additional effect per step."""
     start = search.visited.fitted(())
     assert start is not None
     models = [start]
@@ -205,7 +208,7 @@ def _steps(search: Search, weighed: Sequence[Model]) -> list[Step]:
 
 
 def _alike(search: Search, model: Model, added: AbstractEffect) -> tuple[Named, ...]:
-    """Alternatives to an effect, when it was added or in the final model."""
+    """Alternatives to an effect, in the model to which it was added or in the final model."""
     last = next(e for e in search.at.effects if form(e) == form(added))
     found = (*search.visited.alike(model, added), *search.visited.alike(search.at, last))
     return tuple(dict.fromkeys(n for n in found if n not in search.at.names))

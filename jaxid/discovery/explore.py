@@ -1,4 +1,4 @@
-"""Best first over sets of effects, each predicted in the linear system."""
+"""Best-first search over sets of effects, each predicted in the linear system."""
 
 import dataclasses
 from collections import Counter
@@ -16,22 +16,25 @@ from .likelihood import score
 from .predict import Prediction, least_squares
 from .score import spanned
 
-# Difference of scores that decides: odds of 150 to 1.
+# Decisive difference of scores: odds of 150 to 1.
 DECISIVE = 10.0
-# Sets from which the search goes on, entries and pairs that are added to each.
+# Number of sets that are extended, and of single effects and pairs that are added to each.
 _OPEN, _ADDED, _PAIRED = 3, 5, 2
-# Entries whose best pairs are looked for.
+# Number of leading entries whose best partner is searched.
 _FIRSTS = 8
-# Sets whose noise is estimated with them, and turns of that; the others are too far behind.
+# Number of the best sets whose own noise filters are estimated, and of iterations of that.
 _REFINED, _TURNS = 8, 3
-# Share of the best entry's evidence that a shape between those of the grid may make up for.
+# Entries with less than this share of the best evidence are not added. The share is not near one
+# because shapes are on a grid, and the true shape may be between its points.
 _BEHIND = 0.5
 
 
 class Candidate(eqx.Module):
-    """A set of effects, with a free-form curve or without, and its score in the linear system.
+    """A set of effects, with or without a free-form curve, and its score in the linear system.
 
-    `rest` is what it leaves; `taken` how far the base moved for it; `columns` those of its curve.
+    - `rest`: its residual, not whitened.
+    - `taken`: changes of the base's values that belong to it.
+    - `columns`: columns of its curve.
     """
 
     effects: tuple[AbstractEffect, ...]
@@ -45,23 +48,23 @@ class Candidate(eqx.Module):
 
     @property
     def freedom(self) -> int:
-        """How many physical values were estimated."""
+        """Number of estimated physical values."""
         knots = 0 if self.columns is None else self.columns.shape[-1]
         return self.prediction.freedom + knots
 
     @property
     def size(self) -> int:
-        """How many effects and curves were chosen."""
+        """Number of chosen effects and curves."""
         return len(self.effects) + (self.curve is not None)
 
     @property
     def key(self) -> tuple:
-        """Which effects are in it, whatever their order and values."""
+        """Identity of the set, independent of order and values."""
         return key_of(self.effects, self.curve)
 
 
 def key_of(effects: Sequence[AbstractEffect], curve: Curve | None = None) -> tuple:
-    """What tells sets of effects apart, but for their values."""
+    """Identity of a set of effects, independent of order and values."""
     given = [*effects, *([] if curve is None else [curve])]
     return tuple(sorted((form(e) for e in given), key=repr))
 
@@ -71,15 +74,16 @@ def explore(
     most: int,
     say: Callable[[str], None],
 ) -> list[Candidate]:
-    """All sets that were looked at, best first.
+    """All examined sets, best first.
 
-    From the best set, and from those that are not decisively behind it, others are made by adding
-    an effect or two, taking one out, putting another in its place, or adding a curve; until no set
-    that is made so is better.
+    The best set, and those that are not decisively worse, are changed: one or two effects are
+    added, one is removed, one is replaced, or a curve is added. The search ends when no change
+    gives a better set.
 
     **Arguments:**
 
-    - `most`: effects of a set at the most.
+    - `most`: largest number of effects in a set.
+    - `say`: function that reports the set that is examined.
     """
     nothing = _candidate(landscape, landscape.predictor.predict(()))
     seen: dict[tuple, Candidate] = {nothing.key: nothing}
@@ -105,7 +109,10 @@ def _ranked(seen: dict[tuple, Candidate]) -> list[Candidate]:
 
 
 def _next(seen: dict[tuple, Candidate], opened: set[tuple]) -> Candidate | None:
-    """The best set that is still to be opened; none that does better with less."""
+    """The best set that has not been extended yet; None if there is none.
+
+    Sets that contain a better set are not extended.
+    """
     plain: list[Candidate] = []
     for c in _ranked(seen):
         if (
@@ -125,16 +132,17 @@ def _candidate(landscape: Landscape, found: Prediction) -> Candidate:
 
 
 def _scored(landscape: Landscape, c: Candidate, rest: np.ndarray) -> Candidate:
-    """A set with what it leaves, and the score of that."""
+    """A set with a new residual, and the score of this residual."""
     judged = score(landscape.predictor.data, rest, c.freedom, c.size, landscape.forms)
     return dataclasses.replace(c, score=judged.value, noise=judged.noise, rest=rest)
 
 
 def _refined(landscape: Landscape, c: Candidate) -> Candidate:
-    """A set with its amplitudes, and all that the base absorbs, estimated through its own noise.
+    """A set whose amplitudes and base values are estimated with its own noise filters.
 
-    Sets are looked for through one noise for all. A full fit has its own, and with it a likelihood
-    that is larger the more is left to explain.
+    The search predicts all sets with the same filters. A full fit estimates filters of its own,
+    which raise its likelihood, most of all where much of the residual is unexplained. Only with
+    filters of its own is the score of a set comparable with that of a fit.
     """
     for _ in range(_TURNS if np.isfinite(c.score) else 0):
         better = _estimated(landscape, c, c.noise)
@@ -145,7 +153,7 @@ def _refined(landscape: Landscape, c: Candidate) -> Candidate:
 
 
 def _estimated(landscape: Landscape, c: Candidate, noise: Sequence[ARFilter]) -> Candidate:
-    """A set with all that is linear in it estimated from where it is, through noise filters."""
+    """A set whose linear values are estimated again, from their current values."""
     data = landscape.predictor.data
     wide = [data.base, c.prediction.moved, *([] if c.columns is None else [c.columns])]
     columns = np.concatenate(wide, axis=-1)
@@ -199,16 +207,19 @@ def _moves(
 
 
 def _fitted(loop: ClosedLoop) -> list[AbstractEffect]:
-    """The loop's own effects of which anything is estimated: what is held may be wrong."""
+    """The loop's own effects with a free parameter.
+
+    Effects without one are left out, because their held values may be wrong.
+    """
     places = {p.place[1] for p in loop.free_parameters if p.place[0] == "effects"}
     return [e for k, e in enumerate(loop.effects) if k in places]
 
 
 def _plain(entries: Sequence[Entry], had: Counter) -> list[Entry]:
-    """Entries of the catalogue; none that is there as often as a joint may have it.
+    """Entries of the catalogue of which the joint may have one more.
 
-    Two ends of a travel, two harmonics of a ripple: three of a kind come close to something else,
-    and so do two of other kinds.
+    A joint may have two effects of some kinds, such as end stops at both ends of the travel or two
+    harmonics of a ripple, and one of the others. More of them only approximate another effect.
     """
     return [
         e
@@ -218,7 +229,7 @@ def _plain(entries: Sequence[Entry], had: Counter) -> list[Entry]:
 
 
 def _with_curves(landscape: Landscape, at: Candidate) -> list[Candidate]:
-    """The set with each of the curves that explain most beside it."""
+    """The set with each of the curves that explain most of its residual."""
     entries = landscape.beside(at.prediction, _PAIRED, curves=True)
     return [_curved(landscape, at, e) for e in entries if e.evidence > 0]
 

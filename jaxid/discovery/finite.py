@@ -1,4 +1,4 @@
-"""What has no derivative at nothing: effects at a finite size, each in a simulation of its own."""
+"""Effects without a derivative at zero: each is simulated at a finite size."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -21,15 +21,15 @@ from ..simulation.runs import each, run
 from ..simulation.sharing import at_once, one_by_one
 from ..simulation.steps import with_rolled_stages
 
-# Settings of one call, as many as a processor takes in one instruction. It is the same for
-# screening and for predictions, so that both use one program.
+# Settings that one call simulates: as many as fit into one vector instruction. Screening and
+# predictions use the same number, so that they share one compiled program.
 _AT_ONCE = 4
 
 
 class OneOf(AbstractTransmission):
-    """One of several transmissions on a joint, by number; with a number below zero none.
+    """One of several transmissions on a joint, by its number; none if the number is negative.
 
-    The choice is data, so that one program serves all of them.
+    The number is an array, so that one compiled program simulates all of them.
     """
 
     joint: int = eqx.field(static=True)
@@ -38,15 +38,15 @@ class OneOf(AbstractTransmission):
 
     @property
     def rotor(self) -> Float[Array, ""]:
-        """Of the chosen one."""
+        """Rotor inertia of the chosen transmission."""
         return self._of_chosen([option.rotor for option in self.options], 1.0)
 
     def present(self) -> Bool[Array, ""]:
-        """Whether there is one, and it gives way."""
+        """Whether a transmission is chosen, and is compliant."""
         return self._of_chosen([option.present() for option in self.options], False)
 
     def through(self, twist: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
-        """Torque that the chosen one passes on, N·m."""
+        """Torque that the chosen transmission transmits, N·m."""
         return self._of_chosen([option.through(twist, rate) for option in self.options], 0.0)
 
     def _of_chosen(self, values: Sequence[Any], otherwise: float | bool) -> Any:
@@ -63,20 +63,19 @@ def differences(
     row: int,
     nominal: Float[Array, "recordings points joints"],
 ) -> list[Float[np.ndarray, "recordings points joints"]]:
-    """What effects change of a signal, by a simulation with each of them.
+    """Changes of a signal by effects, from one simulation with each of them.
 
-    All transmissions and limits of all joints share a program. Finite effects of other kinds have
-    one for each structure.
+    All transmissions and limits of all joints share one compiled program. Other finite effects have
+    one program for each structure.
 
     **Arguments:**
 
-    - `effects`: each at a finite setting, and none on a joint whose drive and link are parted
-      already.
-    - `row`: which of `SIGNALS`.
-    - `nominal`: the signal without them, as the loop alone has it.
+    - `effects`: effects at finite settings. A transmission must be on a joint that has none.
+    - `row`: index of the signal in `SIGNALS`.
+    - `nominal`: the signal of the loop without the effects.
 
-    **Returns:** one `(recordings, points, joints)` for each effect, N·m or N for a torque, rad or m
-    for a position.
+    **Returns:** for each effect an array `(recordings, points, joints)`, N·m or N for a torque, rad
+    or m for a position.
     """
     if not effects:
         return []
@@ -87,7 +86,9 @@ def differences(
     found = {k: run - np.asarray(nominal) for k, run in zip(still, runs, strict=True)}
     parted = [k for k in range(len(effects)) if k not in found]
     if parted:
-        # With them the motion is not given any more: what feedback errs by is to be in both.
+        # With these effects the motion is not imposed. The virtual law then has a tracking error,
+        # which cancels if the nominal signal is simulated in the same way: with a limit that
+        # does not act.
         several = [*(effects[k] for k in parted), TorqueSaturation(joint=1)]
         *runs, without = _simulated(loop, batch, several, row)
         found |= {k: run - without for k, run in zip(parted, runs, strict=True)}
@@ -107,7 +108,7 @@ def _simulated(
     jobs = []
     for places, settings in groups:
         for first in range(0, len(places), _AT_ONCE):
-            # The last call repeats its last setting, for the program of the others.
+            # The last call repeats its last setting, so that its program is that of the others.
             rows = np.minimum(np.arange(first, first + _AT_ONCE), len(places) - 1)
             stacked = jax.tree.map(lambda *x: np.stack(x), *(settings[k] for k in rows))
             jobs.append(([places[k] for k in rows], stacked))
@@ -127,7 +128,10 @@ _SHARED = (AbstractTransmission, TorqueSaturation)
 
 
 def _together(effects: Sequence[AbstractEffect]) -> list[tuple[AbstractEffect, ...]]:
-    """For each effect the same effects on all joints, of which it alone acts."""
+    """For each effect a set with all transmissions and limits, of which only this one acts.
+
+    The sets have the same structure, so that they share one program.
+    """
     kinds: dict[int, dict[Any, AbstractTransmission]] = {}
     for e in effects:
         if isinstance(e, AbstractTransmission):
@@ -156,7 +160,7 @@ def _one_of(options: tuple[AbstractTransmission, ...], chosen: int) -> OneOf:
 
 
 def by_structure(effects: Sequence[eqx.Module]) -> list[list[int]]:
-    """Places of effects of equal structure together: one trace serves all of them."""
+    """Places of effects, grouped by structure; one trace serves a group."""
     groups: dict[Any, list[int]] = {}
     for k, effect in enumerate(effects):
         leaves, structure = jax.tree.flatten(effect)
@@ -169,7 +173,7 @@ def by_structure(effects: Sequence[eqx.Module]) -> list[list[int]]:
 def _with_effects(
     loop: ClosedLoop, stacked: tuple[AbstractEffect, ...], batch: Batch, row: int
 ) -> Float[Array, "recordings settings points joints"]:
-    """One signal of simulations with some effects, at all their settings."""
+    """One signal of simulations with the effects, at all their settings."""
     loop = with_rolled_stages(loop)
 
     def one(effects, intervals, q0, v0):

@@ -1,4 +1,4 @@
-"""The one score of all models: how likely the recordings are, and the price of what was chosen."""
+"""The score by which models are compared: likelihood of the recordings, and price of the model."""
 
 import math
 from collections.abc import Sequence
@@ -17,9 +17,12 @@ _HIGHEST = 30
 
 
 class Score(eqx.Module):
-    """S = -2 log L + k log n + 2 log(models of that size), with the filters that belong to it.
+    """The score S = -2 log L + k log n + 2 log C(P, s), and the noise filters that belong to it.
 
-    Less is better: exp(-S/2) is a model's weight (Schwarz 1978; Chen and Chen 2008).
+    L is the likelihood of the fitted recordings, n the number of compared samples of all joints, k
+    the number of estimated values and filter coefficients, and C(P, s) the number of sets of s of P
+    effects. A smaller score is better: the weight of a model is proportional to exp(-S/2) (Schwarz
+    1978; Chen and Chen 2008).
     """
 
     value: float
@@ -33,14 +36,14 @@ def score(
     size: int,
     offered: int,
 ) -> Score:
-    """The score of a model, with noise filters of its own.
+    """The score of a model, with noise filters that are estimated from its residual.
 
     **Arguments:**
 
-    - `data`: which samples there are.
-    - `rest`: what the model leaves.
-    - `freedom`: how many physical values were estimated.
-    - `size`: how many effects were chosen, of `offered` that could have been.
+    - `data`: its mask says which samples are compared.
+    - `rest`: the residual of the model.
+    - `freedom`: number of estimated physical values.
+    - `size`: number of chosen effects. `offered`: number of effects to choose from.
     """
     outputs = range(rest.shape[2])
     series = [[r[m, j] for r, m in zip(rest, data.mask, strict=True)] for j in outputs]
@@ -48,7 +51,7 @@ def score(
 
 
 def score_of(fit: Fit, size: int = 0, offered: int = 0) -> Score:
-    """The score of a fit, as `score` has it for what was predicted."""
+    """The score of a fit, comparable with that of a prediction by `score`."""
     series = [[r[:, j] for r in fit.residuals] for j in range(fit.residuals[0].shape[1])]
     return _scored(series, len(fit.names), price(size, offered))
 
@@ -56,20 +59,20 @@ def score_of(fit: Fit, size: int = 0, offered: int = 0) -> Score:
 def noise_filters(
     residuals: Sequence[Float[np.ndarray, "_samples joints"]],
 ) -> tuple[ARFilter, ...]:
-    """The noise filters of residuals, one a joint, as a score has them."""
+    """The noise filters of residuals, one per joint, as in a score."""
     joints = range(residuals[0].shape[1])
     return tuple(filter_of([r[:, j] for r in residuals], _HIGHEST) for j in joints)
 
 
 def _scored(series: Sequence[Sequence[np.ndarray]], freedom: int, paid: float) -> Score:
-    # Rows at which a joint stands still are zero, and none that count.
+    # Rows at which a joint is at rest are zero, and are not counted.
     total = sum(np.count_nonzero(s) for rows in series for s in rows)
     value, noise = 0.0, []
     for rows in series:
-        # A mean is the model's to explain, and not taken off.
+        # The mean is not subtracted: the model must explain it.
         found = filter_of(rows, _HIGHEST)
         size = np.array([max(np.count_nonzero(s), 1) for s in rows])
-        # Recordings have noise of levels of their own where that is worth its price.
+        # Each recording has its own noise level if that lowers the score.
         power = np.array([np.sum(found.whiten(s)[found.order :] ** 2) for s in rows])
         power = np.maximum(power / np.maximum(size - found.order, 1), 1e-300)
         mean = float(size @ power / size.sum())
@@ -83,12 +86,12 @@ def _scored(series: Sequence[Sequence[np.ndarray]], freedom: int, paid: float) -
 
 
 def price(size: int, offered: int) -> float:
-    """2 log of how many sets of that size there are: what it costs to have searched."""
+    """2 log of the number of sets of that size: the price of the choice (Chen and Chen 2008)."""
     return 2 * math.log(math.comb(max(offered, size), size))
 
 
 def weights(values: Sequence[float]) -> Float[np.ndarray, " models"]:
-    """Posterior weights of models by their scores (Madigan and Raftery 1994)."""
+    """Posterior weights of models from their scores (Madigan and Raftery 1994)."""
     array = np.asarray(values, float)
     raw = np.exp(-0.5 * (array - array.min()))
     return raw / raw.sum()

@@ -1,9 +1,9 @@
-"""Sets of effects in the linear system: what a full refit with them would leave.
+"""Predictions of sets of effects in the linear system: the residual that a full refit would leave.
 
-Along a run the loop is a linear system and an effect a force on it. What the effect's shape, its
-amplitudes, the loop's own parameters and initial states make of the residual is found there: by
-projection for what is linear in the base, by damped Gauss-Newton steps for the rest. No model with
-the effect in it is compiled.
+Along a run the loop is a linear system, and an effect is a torque on it. The values of the effects,
+of the loop's own parameters and of the initial states are estimated there: those of the base
+(parameters and initial states) by projection, those of the effects by damped Gauss-Newton steps. No
+model that contains the effects is compiled.
 """
 
 from collections.abc import Sequence
@@ -25,22 +25,22 @@ from .score import Data, spanned
 from .signatures import Placed, force_and_slopes
 from .system import System
 
-# Columns that one response has: of fewer, some are zero, so that few programs are compiled.
+# Columns of one response. Missing columns are filled with zeros, so that few programs are compiled.
 _WIDTH = 8
-# Share of a parameter by which finite effects are moved for their derivative.
+# Relative step of the finite differences for effects that are simulated at a finite size.
 _MOVED = 1e-4
 
 
 class Prediction(eqx.Module):
-    """A set of effects at its best in the linear system.
+    """A set of effects with estimated values, in the linear system.
 
-    - `rest`: what is left of the residual.
-    - `residual`: the same whitened, less what the base absorbs. `loss`: its square.
-    - `moved`: what moving each of the effects' values does to the output, and `slopes` the same
-      whitened.
-    - `taken`: how far the base's values moved.
-    - `freedom`: how many values were estimated, the base among them.
-    - `possible`: whether no amplitude ended on a bound, and the loop does not run away.
+    - `rest`: the residual with the effects, not whitened.
+    - `residual`: the whitened residual minus what the base absorbs. `loss`: its squared norm.
+    - `moved`: derivatives of the output by the values of the effects. `slopes`: the whitened
+      derivatives minus what the base absorbs.
+    - `taken`: changes of the base's values.
+    - `freedom`: number of estimated values, with those of the base.
+    - `possible`: whether no amplitude is at a bound, and the response of the loop is finite.
     """
 
     effects: tuple[AbstractEffect, ...]
@@ -55,10 +55,10 @@ class Prediction(eqx.Module):
 
 
 class Predictor(eqx.Module):
-    """A linear system as it is seen through noise filters, with the base projected out.
+    """A linear system with noise filters, in which sets of effects are predicted.
 
-    - `basis`: of the span of the whitened base, and `base` what the base is in it.
-    - `limits`: how far the base's values may move from where they were fitted.
+    - `basis`: orthonormal basis of the span of the whitened base. `base`: the whitened base in it.
+    - `limits`: smallest and largest change of the base's values.
     """
 
     system: System
@@ -70,11 +70,12 @@ class Predictor(eqx.Module):
 
     @classmethod
     def of(cls, system: System, noise: Sequence[ARFilter], level: Any = None) -> "Predictor":
-        """Of a system.
+        """The predictor of a system.
 
         **Arguments:**
 
-        - `noise`: filters, one an output. `level`: of each recording, as in `Data`.
+        - `noise`: noise filters, one per output.
+        - `level`: noise level of each recording, as in `Data`.
         """
         none = np.zeros((*system.residual.shape, 0))
         data = Data(system.residual, system.base, none, system.mask, level)
@@ -88,12 +89,12 @@ class Predictor(eqx.Module):
         return cls(system, data, tuple(noise), basis, basis.T @ base, (lower, upper))
 
     def predict(self, effects: Sequence[AbstractEffect], steps: int = 20) -> Prediction:
-        """The effects, from where they are, refined together.
+        """A set of effects with their values estimated together, from their current values.
 
         **Arguments:**
 
-        - `effects`: none of them in the system's own loop. `steps`: points that are evaluated at
-          the most.
+        - `effects`: effects that the system's own loop does not contain.
+        - `steps`: largest number of evaluated points.
         """
         effects = tuple(effects)
         if not effects:
@@ -114,7 +115,7 @@ class Predictor(eqx.Module):
         return self._ended(found)
 
     def change(self, effect: AbstractEffect) -> Float[np.ndarray, "recordings samples outputs"]:
-        """What an effect at its values does to the output, N·m or N (rad or m in an open loop)."""
+        """Change of the output by an effect, N·m or N (rad or m in an open loop)."""
         if not effect.finite:
             return self.shown(effect)[..., 0]
         system = self.system
@@ -125,7 +126,7 @@ class Predictor(eqx.Module):
     def absorbed(
         self, left: Float[np.ndarray, "recordings samples outputs"]
     ) -> Float[np.ndarray, " absorbed"]:
-        """How far the base's values move to explain what of a residual they can."""
+        """Changes of the base's values that explain most of a residual."""
         white = self.data.white(left, self.noise).reshape(-1)
         return least_squares(self.basis.T @ white, self.base, self.limits)[0]
 
@@ -135,11 +136,11 @@ class Predictor(eqx.Module):
         value = sum((s[..., 0] for s in shown), none[..., 0])
         slopes = np.concatenate([none[..., 1:], *(s[..., 1:] for s in shown)], axis=-1)
         both = np.concatenate([(self.data.residual - value)[..., None], -slopes], axis=-1)
-        # Where the loop runs away with an effect, no step goes.
+        # A diverging response is rejected as a step.
         there = bool(np.isfinite(both).all())
         both = both if there else np.zeros_like(both)
         white = self.data.white(both, self.noise).reshape(-1, both.shape[-1])
-        # In the span of the base: what is outside of it no value of the base can move.
+        # Coordinates in the span of the whitened base, to which changes of the base are restricted.
         within = self.basis.T @ white
         taken, free = least_squares(within[:, 0], self.base, self.limits)
         absorbed = within.copy()
@@ -149,7 +150,7 @@ class Predictor(eqx.Module):
             absorbed[:, 1:] = open_ @ (open_.T @ within[:, 1:])
         before = np.linalg.norm(white, axis=0)
         white = white - self.basis @ absorbed
-        # What the base does as well is rounding now, and no direction to go.
+        # A column that the base absorbs consists of rounding errors now; it is set to zero.
         white[:, 1:] *= np.linalg.norm(white[:, 1:], axis=0) > 1e-7 * before[1:]
         gram = white.T @ white
         loss = gram[0, 0] if there else np.inf
@@ -166,9 +167,10 @@ class Predictor(eqx.Module):
     def shown(
         self, effect: AbstractEffect
     ) -> Float[np.ndarray, "recordings samples outputs columns"]:
-        """What an effect does to the output, N·m or N (rad or m in an open loop), and its slopes.
+        """Change of the output by an effect, and its derivatives.
 
-        The first column is the change, the others are its derivatives by the free parameters.
+        The first column is the change, N·m or N (rad or m in an open loop). The others are its
+        derivatives by the free parameters of the effect.
         """
         if effect.finite:
             return self._by_simulation(effect)
@@ -230,12 +232,12 @@ def least_squares(
     columns: Float[np.ndarray, "rows columns"],
     limits: tuple[Float[np.ndarray, " bounded"], Float[np.ndarray, " bounded"]],
 ) -> tuple[Float[np.ndarray, " columns"], Bool[np.ndarray, " columns"]]:
-    """Coefficients of a bounded least-squares problem, and which of them are on no bound.
+    """Coefficients of a bounded least-squares problem, and which of them are not at a bound.
 
     **Arguments:**
 
-    - `left`, `columns`: few rows, of a decomposition of many.
-    - `limits`: of the first columns; the others have none.
+    - `left`: right-hand side. `columns`: matrix, with few rows (coordinates in a basis).
+    - `limits`: lower and upper bounds of the first columns; the others have none.
     """
     size = np.linalg.norm(columns, axis=0)
     size[size == 0] = 1.0
@@ -248,14 +250,14 @@ def least_squares(
         return taken / size, np.ones(len(size), bool)
     import scipy
 
-    # An open interval, also for a value that may not move at all.
+    # The solver needs an interval of positive length, also for a value that may not change.
     room = 1e-9 * (1 + np.abs(taken).max())
     found = scipy.optimize.lsq_linear(scaled, left, (low - room, high + room), method="bvls")
     return np.clip(found.x, low, high) / size, found.active_mask == 0
 
 
 class _Reached(eqx.Module):
-    """What there is at some values of the effects' parameters."""
+    """Output, derivatives and sums of squares at some values of the effects' parameters."""
 
     effects: tuple[AbstractEffect, ...]
     value: np.ndarray

@@ -1,4 +1,4 @@
-"""Hypotheses ranked by what their signatures explain of the whitened residual."""
+"""Ranking of hypotheses by the share of the whitened residual that their signatures explain."""
 
 import dataclasses
 from typing import Any
@@ -20,12 +20,13 @@ from .score import Data, Gram, chance, corrected, effective_tests
 from .separate import columns_of, estimate_noise, leftover
 from .system import System
 
-# Rows from which noise is told from physics as well as from all: a minute of two joints at 400 Hz.
+# Largest number of rows from which noise is estimated (a minute of two joints at 400 Hz). More rows
+# do not improve the estimate.
 _ENOUGH = 50_000
 
 
 class Screened(eqx.Module):
-    """The linear system of a fit, what may be missing in it, and the signatures of that."""
+    """The linear system of a fit, the hypotheses about it, and their signatures."""
 
     system: System
     hypotheses: tuple[Hypothesis, ...]
@@ -34,16 +35,16 @@ class Screened(eqx.Module):
 
 
 def judge(fit: Fit | Comparison, screened: Screened, significance: float) -> Diagnosis:
-    """Hypotheses ranked by what they explain, with the noise told apart.
+    """The diagnosis: noise filters are estimated, and the hypotheses are ranked.
 
-    **Raises:** `FitError` where what is left is too large to be held against anything.
+    **Raises:** `FitError` if the residual is too large for the computation.
     """
     try:
         return _judged(fit, screened, significance)
     except np.linalg.LinAlgError as error:
         raise FitError(
-            f"what is left of these recordings by {fit.loop.name} is too large to be held against "
-            "anything: check the units of the recordings and the loop's gains"
+            f"the residual of {fit.loop.name} on these recordings is too large to be analysed: "
+            "check the units of the recordings and the loop's gains"
         ) from error
 
 
@@ -100,7 +101,11 @@ def _pair(
     where: tuple[Verdict, ...],
     tests: float,
 ) -> tuple[Verdict, ...]:
-    """Two effects that only together explain what the best curve does, each leading entry tried."""
+    """Two effects that together explain more than the best curve; empty if there are none.
+
+    Each of the leading entries is combined with every other effect. No pair is searched if one
+    effect explains more than the best curve.
+    """
     if not where or not ranking or where[0].evidence < ranking[0].evidence:
         return ()
     effects = [h for h in hypotheses if not isinstance(h.effect, Curve)]
@@ -120,7 +125,7 @@ def _pair(
 
 
 def _keep_better(found: dict[tuple[Any, ...], Verdict], key: tuple[Any, ...], new: Verdict) -> None:
-    """Keeps the better of two settings; one that is not physical gives way to one that is."""
+    """Keeps the better of two settings; a physical one is better than one that is not."""
     old = found.get(key)
     if old is None or (new.possible, new.evidence) > (old.possible, old.evidence):
         found[key] = new
@@ -147,7 +152,7 @@ def _verdict(
 
 
 def _within_bounds(gram: Gram, hypothesis: Hypothesis) -> bool:
-    """Whether the predicted amplitudes are physical (a drag that pushes is not)."""
+    """Whether the predicted amplitudes are within their bounds (a negative drag is not)."""
     values, _ = gram.amplitude(hypothesis.columns)
     return all(
         low < value < high
@@ -158,9 +163,12 @@ def _within_bounds(gram: Gram, hypothesis: Hypothesis) -> bool:
 def _floor(
     fit: Fit | Comparison, data: Data, rest: np.ndarray, lost: int
 ) -> Float[np.ndarray, "recordings joints"]:
-    """Relative error by recording and joint of noise alone, what the model took of it put back."""
+    """Relative error due to noise alone, by recording and joint, %.
+
+    Estimated parameters absorb a part of the noise. The result is corrected for this part.
+    """
     outputs = data.residual.shape[2]
     freedom = 1 - (data.base.shape[-1] + lost) / (data.mask.sum() * outputs)
-    # What is least once whitened may be more than what the model leaves as it is.
+    # The rich model has the smaller whitened residual. Its residual itself may be the larger one.
     share = np.minimum(share_left(fit, data, rest), 1) / np.sqrt(max(freedom, 0.1))
     return fit.error_percent.to_numpy() * share

@@ -1,4 +1,4 @@
-"""Values that a model holds by default, in doubt: a smoothing, the delay of recorded torque."""
+"""Release of values that a model holds by default: a smoothing, the delay of recorded torque."""
 
 import dataclasses
 from collections.abc import Callable
@@ -16,22 +16,23 @@ from ..simulation.runs import simulate_batch
 from .predict import Predictor
 from .score import spanned
 
-# A value above zero is tried so many times larger and smaller.
+# A positive value is also tried multiplied and divided by this factor.
 _FACTOR = 5.0
-# Fields of a smoothed sign, and where they end a parameter's place.
+# Fields of a smoothed sign, and the ends of their places among the parameters.
 _SIGN = "smoothing", "form"
 _SIGNS = {(what,) for what in _SIGN}
-# Samples by which torque may be late as the commands of a sampled law are; more is a mistake in the
-# recordings. Changes of less than this share of a sample, or of a scale, are not worth a fit.
+# Largest delay of a torque in samples that a sampled law explains; a larger one is a mistake in the
+# recordings. Smallest change, as a share of a sample or of a scale, for which a fit is made.
 _LATE, _NOTHING = 2.0, 0.02
 
 
 class Release(eqx.Module):
-    """A loop with values estimated that it held, and what is said of them.
+    """A loop in which held values are free.
 
-    - `gain`: by how much the score is predicted to fall.
-    - `freedom`: values that were estimated and are not among the loop's parameters.
-    - `again`: whether all of them were estimated before, and are estimated from elsewhere.
+    - `said`: the released values in words.
+    - `gain`: predicted decrease of the score.
+    - `freedom`: number of estimated values that are not parameters of the loop.
+    - `again`: whether all values were free before, so that only their start values are new.
     """
 
     loop: ClosedLoop
@@ -42,12 +43,12 @@ class Release(eqx.Module):
 
 
 def released(predictor: Predictor, price: float) -> Release | None:
-    """The model of a linear system with held values free that explain more than they cost.
+    """The model with those held values free that explain more than their price; None if none does.
 
     **Arguments:**
 
-    - `predictor`: the linear system of the fitted model through its noise filters.
-    - `price`: what one estimated value costs of the squared error.
+    - `predictor`: the linear system of the fitted model, with its noise filters.
+    - `price`: smallest decrease of the whitened squared error for one estimated value.
     """
     loop = predictor.system.loop
     nominal = _signal(predictor, loop)
@@ -73,11 +74,11 @@ def released(predictor: Predictor, price: float) -> Release | None:
 
 
 def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str, float]:
-    """Held shapes that explain more elsewhere than they cost: by name, values to begin a fit at.
+    """Start values of the shapes whose change explains more than its price, by name.
 
-    The smoothing and the form of one sign go together: a fit has made up with one for the other.
-    Each setting is simulated, and what it changes is held against the residual as the signature of
-    an effect is. The program is that of the fitted model, so nothing is compiled.
+    Smoothing and form of one sign are changed together, because a fit can replace one by the other.
+    Each setting is simulated, and the change of the signal is compared with the residual like the
+    signature of an effect. The compiled program is that of the fitted model.
     """
     loop = predictor.system.loop
     names = {p.place: p.name for p in loop.parameters}
@@ -98,9 +99,9 @@ def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str
 
 
 def _estimated_signs(loop: ClosedLoop) -> list[Parameter]:
-    """Smoothings and forms that are estimated along an imposed motion.
+    """Free smoothings and forms along an imposed motion.
 
-    Their values may be a minimum that was the best before an effect was there.
+    Their values may belong to a local minimum of a model that lacked an effect.
     """
     if not imposed(loop):
         return []
@@ -108,7 +109,10 @@ def _estimated_signs(loop: ClosedLoop) -> list[Parameter]:
 
 
 def _instead(sign: Parameter) -> Callable[[Predictor, np.ndarray], float]:
-    """What a change of an estimated sign explains in place of what its own derivatives absorb."""
+    """The function for what a change of a free sign explains.
+
+    The derivatives of the sign are removed from the base first, because they absorb the change.
+    """
 
     def gain(predictor: Predictor, change: np.ndarray) -> float:
         free = predictor.system.loop.free_parameters
@@ -128,16 +132,16 @@ def _instead(sign: Parameter) -> Callable[[Predictor, np.ndarray], float]:
 
 
 def _settings(p: Parameter, together: list[str], loop: ClosedLoop) -> list[dict[str, float]]:
-    """Other values worth trying, of a parameter or of a sign's smoothing and form."""
+    """Other values to try, of a parameter or of a sign's smoothing and form."""
     if not together:
         return [{p.name: value} for value in _elsewhere(p, loop)]
     smoothing, form = together
     signs = [q for q in loop.parameters if q.place[2:] in _SIGNS]
     named = {q.name: float(np.asarray(q.where(loop))) for q in signs}
-    # From a bound at nothing no factor leads away.
+    # Multiplication does not change a value at the bound zero.
     scale = next(q.declaration.scale for q in signs if q.name == smoothing)
     centre = named[smoothing] if named[smoothing] > _NOTHING * scale else scale
-    # Along a given motion a simulation costs next to nothing.
+    # A simulation along an imposed motion costs almost nothing.
     fine = imposed(loop)
     factors = (0.2, 0.4, 0.7, 1.0, 1.5, 2.5, 5.0) if fine else (0.2, 1.0, 5.0)
     forms = (0.0, 0.3, 0.6, 1.0) if fine else (0.0, 1.0)
@@ -153,9 +157,9 @@ def _settings(p: Parameter, together: list[str], loop: ClosedLoop) -> list[dict[
 
 
 def _lateness(predictor: Predictor, nominal: np.ndarray, price: float) -> tuple[float, float]:
-    """How much later than recorded the torque acts, s, where no law is simulated; else nil.
+    """Estimated delay of the torque, s, and what it explains of the squared error.
 
-    And what that explains.
+    Zero if a law is simulated, or if the delay explains too little, is too small or too large.
     """
     system = predictor.system
     if not imposed(system.loop) or nominal.shape[1] < 3:
@@ -169,27 +173,27 @@ def _lateness(predictor: Predictor, nominal: np.ndarray, price: float) -> tuple[
 
 
 def _signal(predictor: Predictor, loop: ClosedLoop) -> Float[np.ndarray, "recordings samples n"]:
-    """What is compared of a simulation along the recordings, before any filter."""
+    """The compared signal of a simulation along the recordings, before the band filter."""
     system = predictor.system
     return np.asarray(getattr(simulate_batch(loop, system.batch), SIGNALS[system.row]))
 
 
 def _fall(predictor: Predictor, gain: float) -> float:
-    """By how much the score falls where that much of the squared error is explained."""
+    """Decrease of the score if that much of the squared error is explained."""
     left = float(np.sum(_white(predictor, predictor.data.residual) ** 2))
     rows = int(predictor.data.mask.sum()) * predictor.data.residual.shape[2]
     return rows * float(np.log(left / max(left - gain, 1e-9 * left)))
 
 
 def _gain(predictor: Predictor, change: np.ndarray) -> float:
-    """What a change explains, as it is or where it is more at its best size."""
+    """What a change explains of the squared error, at its own size or at the best positive size."""
     along, gain = _held_against(predictor, change)
     size = gain / max(along**2, 1e-300)
     return max((2 * along - 1) * size, gain if along > 0 else 0.0)
 
 
 def _held_against(predictor: Predictor, change: np.ndarray) -> tuple[float, float]:
-    """How much of a change is in the residual beside the base, and what that explains."""
+    """The best multiple of a change, and what it explains of the squared error."""
     seen = _compared(predictor, change)
     shown, residual = (_white(predictor, x) for x in (seen, predictor.data.residual))
     along, size = float(residual @ shown), max(float(shown @ shown), 1e-300)
@@ -197,15 +201,15 @@ def _held_against(predictor: Predictor, change: np.ndarray) -> tuple[float, floa
 
 
 def _compared(predictor: Predictor, change: np.ndarray) -> np.ndarray:
-    """A change of the simulated signal as it is compared."""
+    """A change of the simulated signal, filtered to the compared band."""
     batch = predictor.system.batch
     return np.asarray(batch.compared(change * np.asarray(batch.mask)[..., None]))
 
 
 def doubtful(loop: ClosedLoop) -> list[Parameter]:
-    """Shapes of the model's effects that are held by declaration, not because a user held them.
+    """Shapes of the model's effects that are held by declaration, not by the user.
 
-    The smoothing of an effect follows that of the joint's Coulomb friction, and is none of them.
+    Smoothings that follow that of the joint's Coulomb friction are left out.
     """
     free = {p.place for p in loop.free_parameters}
     return [
@@ -220,19 +224,19 @@ def doubtful(loop: ClosedLoop) -> list[Parameter]:
 
 
 def _follows(p: Parameter, loop: ClosedLoop) -> bool:
-    """Whether a smoothing is that of the joint's Coulomb friction, which another effect has."""
+    """Whether a smoothing follows that of the joint's Coulomb friction."""
     effect = loop.effects[int(p.place[1])] if p.place[0] == "effects" else None
     return p.place[2:] == ("smoothing",) and not isinstance(effect, Coulomb)
 
 
 def _elsewhere(p: Parameter, loop: ClosedLoop) -> list[float]:
-    """Other values worth trying, within bounds."""
+    """Other values to try, within bounds."""
     value = float(np.asarray(p.where(loop)))
     low, high = p.declaration.lower, p.declaration.upper
     if value > 0:
         tried = value / _FACTOR, value * _FACTOR
     else:
-        # A small step says whether it helps beside what else moves, a large one how far it goes.
+        # A small and a large value: the effect of a change on the residual is not linear.
         tried = p.declaration.scale / _FACTOR, p.declaration.scale
     return [x for x in tried if low <= x <= high]
 
@@ -240,6 +244,6 @@ def _elsewhere(p: Parameter, loop: ClosedLoop) -> list[float]:
 def _white(
     predictor: Predictor, rows: Float[np.ndarray, "recordings samples outputs"]
 ) -> Float[np.ndarray, " rows"]:
-    """Rows through the noise filters, less what the base absorbs."""
+    """Whitened rows minus what the base absorbs."""
     white = predictor.data.white(rows, predictor.noise).reshape(-1)
     return white - predictor.basis @ (predictor.basis.T @ white)

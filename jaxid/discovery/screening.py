@@ -1,4 +1,4 @@
-"""Every effect of the catalogue held against the residual of one fit, without a refit."""
+"""Screening: every effect of the catalogue is compared with the residual of one fit."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -33,33 +33,35 @@ def diagnose(
     significance: float = 0.01,
     progress: bool = True,
 ) -> Diagnosis:
-    """Screens every effect of a catalogue, on all joints, at all settings, from one fit.
+    """Ranks the effects of a catalogue, on all joints and at all settings, by one fit.
 
-    Exact sensitivities make it cheap: the closed loop is linearised along its runs, and every
-    hypothesis is the response of that linear system to its torque.
+    The closed loop is linearised along its runs. The signature of an effect is the response of this
+    linear system to the torque of the effect. A signature that explains a part of the residual is
+    evidence for the effect (score test: Rao 1948). No model is fitted again.
 
     **Arguments:**
 
-    - `fit`: of a loop that can be simulated; or a comparison of a loop with recordings.
+    - `fit`: a fit of a loop that can be simulated, or a comparison of a loop with recordings.
     - `catalogue`: effect classes, effects, or functions from a `Scene` to effects; for instance
       `(*jaxid.catalogue, Mine)`.
-    - `significance`: corrected p-value below which something counts as missing.
+    - `significance`: corrected p-value below which an effect counts as missing.
+    - `progress`: whether to show the progress.
 
-    **Raises:** `FitError` where the fitted loop cannot be simulated; `RecordingError` where
-    recordings were sampled at different rates.
+    **Raises:** `FitError` if the fitted loop cannot be simulated, or if the residual is only
+    rounding; `RecordingError` if the recordings have different sample rates.
     """
     fit.recordings.common_period()
     if fit.error_percent.to_numpy().max() < 1e-8:
         raise FitError(
-            f"{fit.loop.name} leaves nothing of these recordings but rounding: they were simulated "
-            "with it, and there is nothing to diagnose"
+            f"the residual of {fit.loop.name} on these recordings is only rounding, because they "
+            "were simulated with this model: a diagnosis is not possible"
         )
     with working(f"diagnosis of {fit.loop.name}", progress) as say:
         return judge(fit, screen(fit, catalogue, say), significance)
 
 
 def screen(fit: Fit | Comparison, catalogue: Sequence[Any], say: Callable[[str], None]) -> Screened:
-    """The linear system of a fit, and the signatures of all that may be missing.
+    """The linear system of a fit, and the signatures of all hypotheses.
 
     **Arguments:** as for `diagnose`.
     """
@@ -80,19 +82,19 @@ def screen(fit: Fit | Comparison, catalogue: Sequence[Any], say: Callable[[str],
     return Screened(system, tuple(hypotheses), data, scene)
 
 
-# Share of the residual's power by which the linear system may err for its signatures to be used
-# at values that are close to those at which it was linearised.
+# Largest error of the linear system at other parameter values, as a share of the residual's power,
+# for which its signatures are used at these values as well.
 _ERRS = 1e-4
 
 
 def carried(screened: Screened, before: Fit, after: Fit) -> Screened | None:
-    """What was screened at one fit, for a later fit of the same loop that is close to it.
+    """The screening of one fit, for another fit of the same loop with almost the same values.
 
-    None if the linear system does not predict what the later fit leaves.
+    None if the linear system does not predict the residual of the other fit.
 
     **Arguments:**
 
-    - `before`: the fit that was screened. `after`: with other values of the same parameters.
+    - `before`: the screened fit. `after`: a fit with other values of the same parameters.
     """
     mask, count = screened.data.mask, len(after.names)
     sizes = [len(r) for r in after.residuals]
@@ -116,12 +118,14 @@ def carried(screened: Screened, before: Fit, after: Fit) -> Screened | None:
 def offered(
     system: System, recordings: Recordings, catalogue: Sequence[Any]
 ) -> tuple[Scene, list[tuple[AbstractEffect, float]]]:
-    """What of a catalogue can be asked of a model, with how many settings each stands for.
+    """Effects of a catalogue that can be missing in a model, each with its number of tests.
 
     **Arguments:**
 
-    - `system`: of the fitted model. `recordings`: that it was fitted to.
+    - `system`: linear system of the fitted model. `recordings`: the fitted recordings.
     - `catalogue`: as for `diagnose`.
+
+    **Returns:** the scene, and pairs of an effect and the number of settings that it stands for.
     """
     loop, motion = system.loop, system.linear.motion
     time = np.asarray(at_rows(system.batch, motion.t))
@@ -138,11 +142,11 @@ def offered(
 
 
 def _can_be_told(loop: ClosedLoop, effect: AbstractEffect) -> bool:
-    """Whether the recordings can show an effect through this loop.
+    """Whether the recordings can show an effect, with this controller.
 
-    What gives an arm a motion of its own, or a drive a memory, is seen through a law that is
-    simulated. In space the one that is made up for an unknown one costs minutes to compile, and
-    what it shows is its own answer more than the arm's.
+    Elasticity, and a drive with states, need a simulated law. If the law is unknown, a virtual law
+    is simulated for them. For a spatial arm it takes minutes to compile, and the result depends on
+    the virtual law more than on the arm.
     """
     return loop.arm.planar() or not imposed(loop) or imposed(loop.add(effect))
 
@@ -152,26 +156,26 @@ def _check_finite(
     hypotheses: Sequence[Hypothesis],
     table: Float[np.ndarray, "recordings points outputs columns"],
 ) -> None:
-    """Raises `FitError` where a signature is not finite."""
+    """Raises `FitError` if a signature is not finite."""
     there = np.asarray(np.isfinite(table).all(axis=(0, 1, 2)))
     bad = [h for h in hypotheses if not there[list(h.columns)].all()]
     if len(bad) > len(hypotheses) / 2:
         raise FitError(
-            f"{loop.name} runs away once it is linearised along these recordings: take smaller "
-            "steps, jaxid.Stepping(substeps=...)"
+            f"the linearisation of {loop.name} along these recordings diverges: use smaller steps, "
+            "jaxid.Stepping(substeps=...)"
         )
     if bad:
         first = bad[0]
         raise FitError(
             f"the signature of {first.name} on joint {first.joint or 'all'} is not finite along "
-            "these recordings: mend its torque, or leave it out of the catalogue"
+            "these recordings: correct its torque, or leave it out of the catalogue"
         )
 
 
 def _tones(
     residual: np.ndarray, mask: np.ndarray, period: float, most: int = 4
 ) -> tuple[list[list[float]], float]:
-    """Frequencies that stand out of each joint's spectrum, and how many they were picked from."""
+    """Peak frequencies of each joint's spectrum, and the number of candidate frequencies."""
     n = residual.shape[1]
     f = np.fft.rfftfreq(4 * n, period)
     usable = (f > 2 / (n * period)) & (f < 0.4 / period)
@@ -182,7 +186,7 @@ def _tones(
             window = np.zeros(n)
             window[there] = np.hanning(int(there.sum()))
             power += np.abs(np.fft.rfft(row * window, 4 * n)) ** 2
-        # Against the level around it, so that coloured noise does not take every place.
+        # Relative to the level around it, so that coloured noise does not give all the peaks.
         width = max(9, n // 20)
         around = np.exp(np.convolve(np.log(power + 1e-300), np.ones(width) / width, mode="same"))
         stands = np.where(usable, power / around, 0.0)

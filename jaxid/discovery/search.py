@@ -1,4 +1,4 @@
-"""The search for what a model lacks: predict in the linear system, verify by full fits."""
+"""The search for missing effects: prediction in the linear system, verification by full fits."""
 
 import dataclasses
 from collections import Counter
@@ -30,19 +30,26 @@ from .verdict import Outcome
 from .verify import Refits, is_there, needed
 from .watched import ROUND, Watched
 
-# Sets that are refitted in one round, and the share of what the best gains by which predictions
-# are off.
+# Largest number of sets that are refitted in one round, and the relative error of predicted
+# decreases of the score.
 _VERIFIED, _INEXACT = 3, 0.08
-# Effects that a fitted model is short of at most: sets of two are predicted to a few per cent of
-# what they explain, larger ones are looked for from the next fit.
+# Largest number of effects in a predicted set. What sets of two explain is predicted to a few per
+# cent; larger sets are searched from the next fit.
 _AHEAD = 2
-# Share of what a model leaves that an effect must explain where the law is unknown: what filters on
-# motion and torque, ticks and stiction leave is of that size in the best of recordings.
+# Smallest relevant effect if the law is unknown, as a share of the residual: filters on motion and
+# torque, ticks and stiction cause errors of this size even in good recordings.
 _BLURRED = 0.25
 
 
 class Search:
-    """A search under way: which models were looked at, and which is the best."""
+    """A search, with the examined models and the current one.
+
+    **Arguments:**
+
+    - `asked`: the arguments of the discovery.
+    - `campaign`: saved steps.
+    - `say`: function that reports an activity. `draw`: function that draws a figure.
+    """
 
     def __init__(
         self,
@@ -61,7 +68,11 @@ class Search:
         self.diagnoses: dict[tuple, Diagnosis] = {}
 
     def run(self, loop: ClosedLoop) -> tuple[Outcome, bool]:
-        """Rounds of predicting and verifying, until nothing is better; the verdict follows."""
+        """Predicts and verifies in rounds, until no model has a lower score.
+
+        **Returns:** the verdict before the tests of the final model, and whether `most` stopped the
+        search although a better set was predicted.
+        """
         self.given = loop
         at = self._start(loop)
         while True:
@@ -78,28 +89,29 @@ class Search:
         self.at = at
         outcome = self._verdict(candidates, nothing)
         if self.at.key not in self.diagnoses:
-            # A model of an earlier round, from which the search did not go on.
+            # A model of an earlier round, from which the search did not continue.
             assert self.at.fit is not None
             self._screened(self.at.fit, self.at.effects)
         return outcome
 
     def stopped(self) -> bool:
-        """Ends with the best model that was fitted so far; False where there is none."""
+        """Selects the best fitted model as the final one; False if there is none."""
         fitted = self.visited.ranked(lambda m: m.fit is not None)
         if fitted:
             self.at = fitted[0]
         return bool(fitted)
 
     def _start(self, loop: ClosedLoop) -> Model:
-        """The starting model, fitted with the noise known."""
+        """The starting model, fitted with noise filters."""
         self.watched.begin("fit", "fit of the starting model")
         first = self.campaign.piece("start", lambda: self.refits.first(loop))
-        # A recording along which the first fit runs away is left out of all that follows.
+        # A recording along which the first fit diverges is left out from here on.
         self.refits = dataclasses.replace(self.refits, recordings=first.recordings)
         screened, diagnosis = self._screened(first, ())
-        # Where noise is strongly coloured, plain output error leaves the parameters far off. A
-        # filter fitted to the residual itself would take what is missing for noise.
-        self.watched.begin("fit", "fit of the starting model, with its noise known")
+        # If noise is strongly coloured, plain output error is imprecise. A filter that is estimated
+        # from the residual itself would model a missing effect as noise, so that of the diagnosis
+        # is used.
+        self.watched.begin("fit", "fit of the starting model with noise filters")
         again = self.campaign.piece(
             "start, filtered", lambda: self.refits.filtered(first.loop, diagnosis.noise)
         )
@@ -114,7 +126,7 @@ class Search:
     def _screened(
         self, fit: Fit, effects: Sequence[AbstractEffect], known: Screened | None = None
     ) -> tuple[Screened, Diagnosis]:
-        """The linear system at a fit with its signatures, and the diagnosis, which is kept."""
+        """The linear system at a fit with its signatures, and the diagnosis, which is stored."""
         self.watched.begin("screen", "where the model fails")
         screened = known or screen(fit, self.asked.catalogue, self.watched.say)
         diagnosis = judge(fit, screened, self.asked.significance)
@@ -123,14 +135,14 @@ class Search:
         return screened, diagnosis
 
     def _predicted(self, at: Model) -> tuple[list[Candidate], float]:
-        """Sets beside a fitted model, best first, and the score of adding nothing."""
+        """Sets of additional effects, best first, and the score of the empty set."""
         assert at.fit is not None
-        # The tables are large, so that those of the starting model alone are there already.
+        # The tables are large, so only those of the starting model are stored.
         screened, diagnosis = self.latest or self._screened(at.fit, at.effects)
         self.latest = None
         data = dataclasses.replace(screened.data, level=diagnosis.data.level)
         landscape = Landscape.of(screened.system, data, screened.hypotheses, diagnosis.noise)
-        # At the most that was asked, one more is looked for, to say whether something is left.
+        # At the limit `most` one more effect is searched, to report whether a better set exists.
         left = min(max(self.asked.most - len(at.effects), 1), _AHEAD)
         self.watched.begin("look", "sets of effects in the linear system")
         candidates = explore(landscape, left, self.watched.say)
@@ -139,10 +151,10 @@ class Search:
         return [c for c in candidates if c is plain or self._matters(at, c, plain)], plain.score
 
     def _released(self, at: Model, candidates: Sequence[Candidate], nothing: float) -> Model | None:
-        """The model with values estimated that its own effects held, before an effect is believed.
+        """The model with released values, if that lowers its score; otherwise None.
 
-        None where they explain no more than they cost. Where a law is simulated each is a program
-        of its own, so there one effect that explains more is tried first.
+        Released values are tried before effects. If a law is simulated, each release compiles a
+        program, so a single effect that explains more is tried first.
         """
         fit, predictor = self.seen
         value = np.log(predictor.data.mask.sum() * fit.loop.joints)
@@ -167,17 +179,17 @@ class Search:
         return model
 
     def _verified(self, at: Model, candidates: Sequence[Candidate], nothing: float) -> Model | None:
-        """The best refit of the sets that promise most; None where none is better."""
+        """The best refit of the best predicted sets; None if none is better than the model."""
         plain = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
         tried: list[Candidate] = []
         if plain and len(at.effects) < self.asked.most:
             reach = max(DECISIVE, _INEXACT * (nothing - plain[0].score))
             near = [c for c in plain if c.score < plain[0].score + reach]
-            # What does no better with more is looked at again from the fit with less.
+            # A set that contains a better one is left out: the smaller one is fitted first.
             keys = [Counter(c.key) for c in near]
             tried = [c for k, c in enumerate(near) if not any(x < keys[k] for x in keys[:k])]
             tried = list(islice(filter(self._supported, tried), _VERIFIED))
-        # Effects that come close to what one curve says better are no explanation.
+        # Effects that explain much less than one curve only approximate the curve.
         alone = [c.score for c in candidates if c.curve is not None and not c.effects]
         gain = nothing - min(alone, default=np.inf)
         limit = at.score - max(gain - max(DECISIVE, _INEXACT * gain), 0.0)
@@ -189,16 +201,18 @@ class Search:
         return None if best is None else best[0]
 
     def _supported(self, c: Candidate) -> bool:
-        """Whether each effect explains stretches that did not determine it; noted if not."""
+        """Whether each effect explains left-out stretches; a note names those that do not."""
         fit, predictor = self.seen
         lacking = unsupported(predictor, c) if imposed(fit.loop) else ()
         if lacking:
-            said = f"{listed(lacking)}: explains only the stretches from which it is estimated"
+            said = (
+                f"{listed(lacking)}: does not explain stretches that were left out of its estimate"
+            )
             self.failures = tuple(dict.fromkeys((*self.failures, said)))
         return not lacking
 
     def _fitted(self, at: Model, asked: Candidate, promised: float) -> Model | None:
-        """A set beside a fitted model, fitted in full; None where it does not show."""
+        """A full refit with additional effects; None if it fails or does not determine them."""
         assert at.fit is not None
         before: Fit = at.fit
         together = (*at.effects, *asked.effects)
@@ -212,7 +226,7 @@ class Search:
                 lambda: self.refits.with_effects(before, asked.effects, asked.noise, promised),
             )
         except (ModelError, FitError) as error:
-            # A candidate that cannot be simulated, at values that the linear system liked.
+            # The candidate cannot be simulated at the predicted values.
             self.failures = (*self.failures, f"no fit with {listed(asked.effects)}: {error}")
             return None
         if not fit.status.simulated or not is_there(fit, before):
@@ -220,7 +234,7 @@ class Search:
         return self._visit(self._added(fit), fit)
 
     def had(self, at: Model, effects: Sequence[AbstractEffect]) -> Model | None:
-        """The refit of a set, where values that the start held are free in it as they are here."""
+        """An earlier refit of a set with the same held values released; None if there is none."""
         had = self.visited.fitted(effects)
         if had is None or had.fit is None or at.fit is None:
             return None
@@ -229,7 +243,11 @@ class Search:
         return had if alike and _released(one) == _released(other) else None
 
     def _without_one(self, at: Model) -> Model | None:
-        """The model without one of its effects, where that is better, or nothing worth knowing."""
+        """The model without one of its effects; None if all are needed.
+
+        An effect is removed if that lowers the score, or if its change of the torque is below the
+        smallest relevant change.
+        """
         if not at.effects:
             return None
         assert at.fit is not None
@@ -245,19 +263,19 @@ class Search:
         small = [m for m in found if not self._loses(m, at)]
         best = min(small, key=lambda m: m.score, default=None)
         if best is not None:
-            # What it had more is not worth knowing, and not a rival in any company.
+            # The removed effect is too small to matter, also in other sets.
             self.visited.forget(set(at.key) - set(best.key))
         return best
 
     def _loses(self, less: Model, at: Model) -> bool:
-        """Whether a model with less leaves more of some joint's torque by what is worth knowing."""
+        """Whether a smaller model raises a joint's error by a relevant amount."""
         assert less.left is not None
         assert at.left is not None
         lost = np.sqrt(np.maximum(less.left**2 - at.left**2, 0.0))
         return bool(np.any(lost > self._worth(at, at.left)))
 
     def refitted(self, at: Model, effects: Sequence[AbstractEffect]) -> Model:
-        """A part of a fitted model's effects, fitted from where they are."""
+        """A fitted model with only some of its effects, fitted again from their current values."""
         assert at.fit is not None
         loop, noise = at.fit.loop, at.noise
         kept = [e for e in loop.effects if not any(e is x for x in at.effects)]
@@ -269,7 +287,7 @@ class Search:
         return self._visit(self._added(fit), fit)
 
     def _visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
-        """A fitted model, noted and drawn."""
+        """A fitted model, which is stored and drawn."""
         model = self._judged(effects, fit)
         self.visited.add(model)
         self.watched.fitted(model)
@@ -282,19 +300,19 @@ class Search:
         return Model(effects, judged.value, fit=fit, noise=judged.noise, left=left)
 
     def _added(self, fit: Fit) -> tuple[AbstractEffect, ...]:
-        """The effects that a fit has over the starting model; they stand last."""
+        """The effects of a fit that the starting model lacks; these are its last effects."""
         start = self.visited.fitted(())
         assert start is not None
         assert start.fit is not None
         return fit.loop.effects[len(start.fit.loop.effects) :]
 
     def _matters(self, at: Model, c: Candidate, plain: Candidate) -> bool:
-        """Whether a set changes what is left of some joint's torque by what is worth knowing."""
+        """Whether a set changes a joint's residual by more than the smallest relevant change."""
         assert at.fit is not None
         if at.fit.error_percent.to_numpy().max() < 1e-3:
-            # Recordings without noise: what is left is the integration's.
+            # Recordings without noise: the residual is the error of the integration.
             return False
-        # In units of what the fit leaves, whose relative error is known.
+        # Relative to the residual of the fit, whose relative error is known.
         left = np.linalg.norm(np.concatenate(at.fit.residuals), axis=0)
         changed = np.linalg.norm((c.rest - plain.rest).reshape(-1, c.rest.shape[-1]), axis=0)
         percent = over_recordings(at.fit.error_percent.to_numpy())
@@ -303,18 +321,18 @@ class Search:
     def _worth(
         self, at: Model, percent: Float[np.ndarray, " joints"]
     ) -> Float[np.ndarray, " joints"]:
-        """Change of a joint's torque that is worth knowing, %.
+        """Smallest relevant change of each joint's torque, %.
 
         **Arguments:**
 
-        - `percent`: what a model leaves of each joint's torque.
+        - `percent`: relative error of each joint's torque, %.
         """
         assert at.fit is not None
         least = _BLURRED if imposed(at.fit.loop) else 0.0
         return np.maximum(self.asked.worth, least * percent)
 
     def _left_by(self, c: Candidate) -> np.ndarray:
-        """Relative error by joint that a set predicted in the last round leaves, %."""
+        """Relative error by joint of a set that was predicted in the last round, %."""
         fit, predictor = self.seen
         left = share_left(fit, predictor.data, c.rest)
         return over_recordings(fit.error_percent.to_numpy() * left)
@@ -323,8 +341,9 @@ class Search:
         unfinished = len(self.at.effects) >= self.asked.most
         curved = [c for c in candidates if c.curve is not None and c.score < nothing]
         mine = set(self.at.key)
-        # A curve beside fewer effects: those in a row came close to what it says with less. Beside
-        # the same effects it makes up for what a prediction misses; the last round knows better.
+        # Curves with only a part of the effects of this model: if one of them has a lower score,
+        # the other effects only approximate the curve. Curves with the same effects are judged by
+        # the last round, because earlier predictions of them are less precise.
         rivals = self.visited.ranked(
             lambda m: m.curve is not None and set(key_of(m.effects)) < mine
         )

@@ -44,12 +44,17 @@ _SHOWN = 8
 class Discovery(AbstractShown):
     """The story of a search: the effects that the model lacked, step by step, and the verdict.
 
-    - `verdict`: `"adequate"`, `"explained"`, `"outside_catalogue"` or `"undetermined"`.
+    - `verdict`: `"adequate"` (no candidate improves the score of the starting model, which passes
+      the tests), `"explained"` (effects were added, no further candidate improves the score, and
+      the model passes the tests), `"outside_catalogue"` (a curve of one coordinate describes the
+      residual better than effects of the catalogue do) or `"undetermined"` (the model fails a test,
+      the recordings do not decide, or the search was interrupted).
     - `steps`: the first is the starting model.
     - `reason`: why it is undetermined, and what to do; empty for the other verdicts.
     - `considered`: the examined models, best first.
     - `removed`: effects that were added, and removed later because they were not needed.
-    - `unfinished`: whether the limit `most` stopped the search before all effects were added.
+    - `unfinished`: whether the limit `most` stopped the search although another effect would
+      improve the score. The verdict may still be `"explained"`.
     - `interrupted`: whether the search was interrupted; the last step is the best model until then.
     """
 
@@ -258,9 +263,12 @@ class Discovery(AbstractShown):
         return [f"noise floor {s}: {', '.join(labels)}" for s, labels in by_source.items()]
 
     def suggestion(self) -> Curve:
-        """The free-form curve that explains most of the residual, ready to be added.
+        """The free-form curve that explains most of the residual, with its predicted values.
 
-        **Raises:** `ModelError` if the residual is not significant.
+        It is an effect, so `jaxid.fit(story.loop.add(story.suggestion()), recordings)` fits the
+        model with it.
+
+        **Raises:** `ModelError` if no curve explains a significant part of the residual.
         """
         if not self.diagnosis.depends_on():
             raise ModelError("nothing significant is left, so there is no curve to suggest")

@@ -1,4 +1,4 @@
-"""Whether effects explain stretches of the recordings from which they were not estimated."""
+"""Cross-validation of effects: stretches of the recordings are left out of their estimate."""
 
 from collections.abc import Sequence
 
@@ -10,28 +10,30 @@ from .explore import Candidate
 from .hypotheses import free_of
 from .predict import Predictor
 
-# Stretches that are left out one after the other, of all recordings together and of each at least.
+# Smallest number of stretches that are left out in turn, of all recordings and of each recording.
 _STRETCHES, _LEAST = 6, 2
-# Share of what an effect explains that it must explain where it was not estimated. Noise that was
-# taken for an effect explains less than nothing there; an effect that is at work in some of the
-# stretches only, such as friction at slow motion, explains most of it.
+# Smallest ratio of what an effect explains of left-out stretches to what it explains of the same
+# stretches if they are fitted.
+# For noise the ratio is negative. For an effect that acts in some stretches only, such as friction
+# in slow motion, it is near one.
 _SUPPORTED = 0.3
-# Share of a column's power that the other stretches must hold to determine its value.
+# Share of a column's power that the other stretches must contain to determine its value.
 _WEAK = 1e-4
 
 
 def unsupported(predictor: Predictor, c: Candidate) -> tuple[AbstractEffect, ...]:
-    """Effects of a set that do not explain stretches from which they were not estimated.
+    """Effects of a set that do not explain stretches that were left out of their estimate.
 
-    The score takes what is left for noise of a known spectrum. What a rigid model leaves of a real
-    arm is not: it repeats with the motion, and a flexible effect can follow a stretch of it. Each
-    stretch is predicted from values that are estimated, in the linear system, on all the others.
-    Contacts and limits, which one stretch alone may show, are not judged.
+    The score assumes that the residual is noise with a stationary spectrum. On a real arm the
+    residual of a rigid model depends on the motion, and an effect with many values can follow a
+    stretch of it. Therefore each stretch is predicted in the linear system from values that are
+    estimated on all other stretches. Contacts and torque limits are not tested, because they can
+    act in a single stretch.
 
     **Arguments:**
 
     - `predictor`: the linear system of the fitted model.
-    - `c`: a set beside that model, refined there.
+    - `c`: a set of additional effects with values estimated in that system.
     """
     stretch = _stretches(predictor)
     return tuple(
@@ -45,10 +47,11 @@ def unsupported(predictor: Predictor, c: Candidate) -> tuple[AbstractEffect, ...
 def _share(
     predictor: Predictor, c: Candidate, which: int, stretch: Int[np.ndarray, " rows"]
 ) -> float:
-    """What an effect explains of stretches that were left out, over what it does where fitted."""
+    """Ratio of what an effect explains of left-out stretches to what it explains of fitted ones."""
     data = predictor.data
     shown = predictor.shown(c.effects[which])[..., 0]
-    # Without the effect: an amplitude that no other stretch tells is nothing, and not what it was.
+    # The target is the residual without the effect. An amplitude that the other stretches do not
+    # determine is then estimated as zero, not as its value in the fit.
     parts = (c.rest + shown)[..., None], data.base, c.prediction.moved
     rows = data.white(np.concatenate(parts, axis=-1), c.noise)
     target, columns = np.split(rows.reshape(-1, rows.shape[-1]), [1], axis=1)
@@ -60,13 +63,13 @@ def _share(
 
 
 def _values_of(effects: Sequence[AbstractEffect], which: int) -> Int[np.ndarray, " values"]:
-    """Places of an effect's free values among those of a set."""
+    """Places of an effect's free values among those of the set."""
     counts = [sum(p.size for p in free_of(e)) for e in effects]
     return sum(counts[:which]) + np.arange(counts[which])
 
 
 def _stretches(predictor: Predictor) -> Int[np.ndarray, " rows"]:
-    """The number of the stretch in which each whitened row is."""
+    """The number of the stretch of each whitened row."""
     recordings, samples, outputs = predictor.data.residual.shape
     each = max(_LEAST, -(-_STRETCHES // recordings))
     number = np.arange(samples) * each // samples
@@ -79,7 +82,7 @@ def _errors(
     columns: Float[np.ndarray, "rows columns"],
     stretch: Int[np.ndarray, " rows"],
 ) -> tuple[float, float]:
-    """Squared error of least squares on all rows, and of rows whose stretch was left out."""
+    """Squared errors of least squares on all rows, and of the prediction of left-out stretches."""
     scale = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(scale > 0, scale, 1.0)
     gram, along = columns.T @ columns, columns.T @ target

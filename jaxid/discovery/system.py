@@ -1,4 +1,4 @@
-"""A fitted loop along its recordings, as the linear system that effects act on."""
+"""The linear system of a fitted loop along its recordings, on which effects act."""
 
 import dataclasses
 
@@ -21,13 +21,12 @@ from .signatures import left_for_links
 
 
 class System(eqx.Module):
-    """The loop linearised along its runs, and what of the recordings it leaves.
+    """The loop linearised along its runs, and its residual.
 
-    - `left`: torque that its own effects on the drives leave for the links.
-    - `residual`: measured less simulated at the samples, in the band that is compared.
-    - `base`: what its free parameters, and initial states where they are estimated, do to the
-      output.
-    - `row`: which of `SIGNALS` is compared.
+    - `left`: torque that reaches the links, after the loop's own effects on the drives.
+    - `residual`: measured minus simulated output at the samples, in the compared band.
+    - `base`: derivatives of the output by the free parameters and by the estimated initial states.
+    - `row`: index of the compared signal in `SIGNALS`.
     """
 
     loop: ClosedLoop
@@ -42,7 +41,7 @@ class System(eqx.Module):
     def of(cls, fit: Fit | Comparison) -> "System":
         """The system of a fitted loop.
 
-        **Raises:** `FitError` where the loop cannot be simulated.
+        **Raises:** `FitError` if the loop cannot be simulated.
         """
         loop = with_substeps(fit.loop, fit.recordings)
         output, batch, free = _as_fitted(fit, loop)
@@ -51,20 +50,20 @@ class System(eqx.Module):
         residual, base = _residual_and_base(batch, linear, loop, output, free)
         if not np.isfinite(residual).all() or not np.isfinite(base).all():
             raise FitError(
-                f"{loop.name} cannot be simulated at its fitted values, so nothing can be held "
-                "against its residual: fit it by OEM first"
+                f"{loop.name} cannot be simulated at its fitted values, so it has no residual to "
+                "analyse: fit it by OEM first"
             )
         left = left_for_links(loop, linear.motion)
         return cls(loop, batch, linear, left, residual, base, row)
 
     @property
     def mask(self) -> Bool[np.ndarray, "recordings samples"]:
-        """Which samples are compared."""
+        """Whether each sample is compared."""
         return np.asarray(self.batch.kept)
 
 
 def _as_fitted(fit: Fit | Comparison, loop: ClosedLoop) -> tuple[str, Batch, np.ndarray]:
-    """Which output is compared, the batch, and which initial states are free, as in the fit."""
+    """The compared output, the batch, and whether each initial state is free, as in the fit."""
     method = oem_of(fit)
     pieces = pieces_of(fit.recordings, method.window)
     batch = prepare(loop, pieces)

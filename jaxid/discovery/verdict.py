@@ -1,4 +1,4 @@
-"""Tests that a chosen model must pass before a verdict sounds sure."""
+"""Tests that the final model must pass; otherwise the verdict is `undetermined`."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -21,30 +21,30 @@ from .system import System
 
 Outcome = Literal["adequate", "explained", "outside_catalogue", "undetermined"]
 
-# Error over what noise predicts from which a model is refuted: recordings of one arm differ in
-# their noise by a few per cent, and a tenth more error is seen in a figure.
+# Ratio of the error to that of noise above which a model is rejected. The noise of recordings of
+# one arm differs by a few per cent; an error that is a tenth larger is visible in a figure.
 _REFUTED = 1.10
-# The same where the law is unknown, and how much must be left more, in % of the torque: filters on
-# both signals, the ticks of the law and stiction leave that much beside noise.
+# The same ratio if the law is unknown, and the smallest relevant excess, in % of the torque.
+# Filters on both signals, the ticks of the law and stiction cause errors of this size.
 _BLURRED, _BLUR = 1.30, 1.0
-# Standard deviations that such an excess must be above chance.
+# Smallest significant excess, in standard deviations.
 _SURE = 4.0
-# Share of a joint's torque in % that a model of a robot does not leave, and power of a residual
-# over that of its innovations from which it is no white noise.
+# Relative error of a joint's torque in % above which a model is useless, unless the residual is
+# white noise: ratio of the residual's power to that of its innovations above which it is not white.
 _THIRD, _COLOURED = 33.0, 1.5
-# Probability that the starting model must have, for nothing to be missing.
+# Smallest probability of the starting model for the verdict `adequate`.
 _HALF = 0.5
-# Deviations by which the error on held-out recordings must rise to speak against what was added.
+# Smallest significant increase of the error on held-out recordings, in standard deviations.
 _ROSE = 3.0
 
 
 def misfit_of(fit: Fit) -> str:
-    """Why a fit that explains next to nothing tells nothing, and what to do."""
+    """The reason for a fit that explains almost nothing, with what to do."""
     return f"the fit of the model {fit.status.value}: {_to_check(fit)}"
 
 
 def _to_check(fit: Fit) -> str:
-    """Which mistake explains a misfit, or what to look at."""
+    """The mistake in the data that explains a misfit, or what to check."""
     return likely_cause(fit.loop, fit.recordings) or (
         "check the units of each joint, signs, the order of the joints, time stamps and the "
         "control law"
@@ -52,21 +52,21 @@ def _to_check(fit: Fit) -> str:
 
 
 def undecided(models: Sequence[Model], chosen: Model) -> str:
-    """Whether the starting model shares the weight with the chosen one; empty if not."""
+    """The reason if scores do not decide between starting and chosen model; empty if they do."""
     start = next(m for m in models if not m.effects and m.curve is None)
     if not chosen.effects:
         if start.weight >= _HALF:
             return ""
         rival = next(m for m in models if m is not start)
         return (
-            f"the model as it is has a probability of {start.weight:.2g} only, next to it "
+            f"the starting model has a probability of only {start.weight:.2g}, and "
             f"{rival.label} has {rival.weight:.2g}: record more, or longer"
         )
     if chosen.score < start.score - LIKELY:
         return ""
     return (
-        f"the model as it was is only {start.score - chosen.score:.2g} behind in score, where "
-        f"{LIKELY:.0f} are odds of 20 to 1: record more, or longer"
+        f"the score of the starting model is only {start.score - chosen.score:.2g} larger "
+        f"({LIKELY:.0f} are odds of 20 to 1): record more, or longer"
     )
 
 
@@ -77,16 +77,16 @@ def refuted(
     held_out: tuple[Comparison, Comparison] | None,
     worth: float,
 ) -> str:
-    """Why a model must not be called right; empty where nothing speaks against it.
+    """The first test that a model fails, as a reason; empty if it passes all of them.
 
     **Arguments:**
 
-    - `chosen`: the fit of the model of the best score.
-    - `noise`: filters of what the chosen model leaves, one an output.
-    - `diagnosis`: of the chosen fit.
-    - `held_out`: comparisons of the starting and the chosen model with recordings that no fit has
-      seen.
-    - `worth`: what is worth knowing, in % of a joint's torque.
+    - `chosen`: the fit of the model with the best score.
+    - `noise`: noise filters of its residual, one per output.
+    - `diagnosis`: the diagnosis of the fit.
+    - `held_out`: comparisons of the starting and the chosen model with held-out recordings; None if
+      there are no such recordings.
+    - `worth`: smallest relevant change, in % of a joint's torque.
     """
     if chosen.status is Status.misfit:
         return misfit_of(chosen)
@@ -109,26 +109,29 @@ def refuted(
 
 
 def _explains_little(fit: Fit, noise: Sequence[ARFilter]) -> str:
-    """Whether much of a joint's torque is left that does not look like noise of a sensor."""
+    """The reason if a third of a joint's torque is unexplained and not white noise."""
     left = over_recordings(fit.error_percent.to_numpy())
     for label, percent, filt in zip(joint_columns(fit.loop.joints), left, noise, strict=True):
         if percent > _THIRD and filt.gain > _COLOURED:
-            return f"it leaves {percent:.3g} % of {label}, and not as white noise: {_to_check(fit)}"
+            return (
+                f"the error of {label} is {percent:.3g} %, and its residual is not white noise: "
+                f"{_to_check(fit)}"
+            )
     return ""
 
 
 def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
-    """Whether a part of what is left is there as if torque and motion had clocks of their own.
+    """The reason if torque seems shifted in time against motion.
 
-    To first order that is the torque's rate, which no curve of one coordinate is, and which a noise
-    filter takes for slow noise.
+    To first order the residual of a shift is the derivative of torque. No curve of one coordinate
+    describes it, and a noise filter models it as slow noise.
     """
     data, motion = diagnosis.data, diagnosis.motion
     torque, time = np.asarray(motion.tau), np.asarray(motion.t)
     if torque.shape != data.residual.shape or data.residual.shape[1] < 3:
         return ""
     step = float(np.median(np.diff(time[0])))
-    # Without the noise filters, which have taken such a part for noise.
+    # Without the noise filters, which may have modelled the shift as noise.
     basis = spanned(data.base.reshape(-1, data.base.shape[-1]))
     left = data.residual.reshape(-1)
     left = left - basis @ (basis.T @ left)
@@ -148,16 +151,16 @@ def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
         if large and abs(float(own @ left)) > _SURE * chance:
             order = "before" if late > 0 else "after"
             return (
-                f"what is left of {label} is as if its torque were recorded "
+                f"the residual of {label} suggests that its torque is recorded "
                 f"{1e3 * abs(late):.3g} ms {order} it acts: check time stamps, filters on one of "
-                "the signals and delays of the drive, which "
-                f"jaxid.control.Tracking(delay={late:.3g}) knows of where the law is unknown"
+                "the signals and delays of the drive; if the law is unknown, declare the delay by "
+                f"jaxid.control.Tracking(delay={late:.3g})"
             )
     return ""
 
 
 def _above_floor(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
-    """Whether many effects together explain what the score finds no few of them for."""
+    """The reason if only many effects together explain the residual."""
     if diagnosis.unexplained < DECISIVE:
         return ""
     left = over_recordings(fit.error_percent.to_numpy())
@@ -168,14 +171,14 @@ def _above_floor(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
         return ""
     label = joint_columns(fit.loop.joints)[worst]
     return (
-        f"on the fitted recordings it leaves {left[worst]:.3g} % of {label}, of which noise "
-        f"accounts for {by_noise[worst]:.3g} %: neither the catalogue nor a curve of one "
-        "coordinate explains the difference"
+        f"on the fitted recordings the error of {label} is {left[worst]:.3g} %, and the noise "
+        f"floor {by_noise[worst]:.3g} %: neither the catalogue nor a curve of one coordinate "
+        "explains the difference"
     )
 
 
 def _above_measured(fit: Fit | Comparison, floor: Floor | None, worth: float) -> str:
-    """Whether a joint is left with more than the noise that its recordings show without a model."""
+    """The reason if the error of a joint is above the noise floor measured without a model."""
     if floor is None:
         return ""
     left = fit.error_percent.to_numpy()
@@ -186,21 +189,20 @@ def _above_measured(fit: Fit | Comparison, floor: Floor | None, worth: float) ->
         return ""
     r, j = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
     return (
-        f"on {fit.recordings.names[r]} it leaves {left[r, j]:.3g} % of "
-        f"{joint_columns(fit.loop.joints)[j]}, where the noise of the torque is "
-        f"{floor.low[r, j]:.3g} to {floor.high[r, j]:.3g} % "
-        f"({SPOKEN[floor.sources[r][j]]}): neither the catalogue nor a curve of one coordinate "
-        "explains the difference"
+        f"on {fit.recordings.names[r]} the error of {joint_columns(fit.loop.joints)[j]} is "
+        f"{left[r, j]:.3g} %, and the noise floor is {floor.low[r, j]:.3g} to "
+        f"{floor.high[r, j]:.3g} % ({SPOKEN[floor.sources[r][j]]}): neither the catalogue nor "
+        "a curve of one coordinate explains the difference"
     )
 
 
 def risen(before: Comparison, after: Comparison, noise: Sequence[ARFilter]) -> str:
-    """Whether held-out recordings were described better without what was added; empty if not.
+    """The reason if added effects raised the error on held-out recordings; empty if not.
 
     **Arguments:**
 
-    - `before`, `after`: comparisons with them, without and with what was added.
-    - `noise`: filters of what the later model leaves, one an output.
+    - `before`, `after`: comparisons of the models without and with the added effects.
+    - `noise`: noise filters of the residual of the later model, one per output.
     """
     errors = [over_recordings(c.error_percent.to_numpy()) for c in (before, after)]
     for j, filt in enumerate(noise):
@@ -208,28 +210,28 @@ def risen(before: Comparison, after: Comparison, noise: Sequence[ARFilter]) -> s
         rise = sum(float(a @ a - b @ b) for b, a in pairs)
         changed = [b - a for b, a in pairs]
         moved = sum(float(d @ d) for d in changed)
-        # How far the sum of the noise times the change may be from nothing.
+        # Twice the standard deviation of the sum of noise times change, whose mean is zero.
         chance = 2 * np.sqrt(sum(_through(filt, d) for d in changed))
         if rise > 0 and rise + moved > _ROSE * chance:
             label = joint_columns(after.loop.joints)[j]
             return (
-                f"what was added raised the error of {label} on held-out recordings from "
-                f"{errors[0][j]:.3g} to {errors[1][j]:.3g} %: fit recordings that move like those "
-                "held out as well"
+                f"the added effects raised the error of {label} on held-out recordings from "
+                f"{errors[0][j]:.3g} to {errors[1][j]:.3g} %: also fit recordings with motions "
+                "like the held-out ones"
             )
     return ""
 
 
 def _through(filt: ARFilter, x: Float[np.ndarray, " samples"]) -> float:
-    """Variance of the sum of a series times noise of a filter."""
+    """Variance of the scalar product of a series and noise of a filter."""
     size = 2 * len(x)
     return float(np.sum(np.abs(np.fft.fft(x, size)) ** 2 * filt.spectrum(size)) / size)
 
 
 def _above_noise(fit: Fit, held_out: Comparison, noise: Sequence[ARFilter], worth: float) -> str:
-    """Whether held-out recordings are left with more than noise and unsure parameters explain."""
-    # The loudest of the fitted recordings, or what the held-out one itself shows of noise: noise
-    # may grow with the motion.
+    """The reason if the held-out error is larger than noise and uncertain parameters explain."""
+    # Noise may grow with the motion. Its power is that of the noisiest fitted recording, or the
+    # estimate from the held-out recording itself if that is larger.
     fitted = np.max([np.mean(r**2, axis=0) for r in fit.residuals], axis=0)
     left = np.stack([np.mean(r**2, axis=0) for r in held_out.residuals])
     own = [[_power(f, r[:, j]) for j, f in enumerate(noise)] for r in held_out.residuals]
@@ -246,7 +248,7 @@ def _above_noise(fit: Fit, held_out: Comparison, noise: Sequence[ARFilter], wort
 
     if not np.any(above(power) > _REFUTED):
         return ""
-    # Linearised along the held-out runs only where it may matter: it is a program of its own.
+    # The linearisation along the held-out runs compiles a program, so it is made only if needed.
     expected = power + _unsure(fit, held_out)
     found = above(expected)
     if not np.any(found > _REFUTED):
@@ -254,18 +256,17 @@ def _above_noise(fit: Fit, held_out: Comparison, noise: Sequence[ARFilter], wort
     r, j = np.unravel_index(int(np.argmax(found)), found.shape)
     label = joint_columns(fit.loop.joints)[j]
     return (
-        f"on the held-out recording {held_out.recordings.names[r]} it leaves {percent[r, j]:.3g} % "
-        f"of {label}, where noise accounts for "
-        f"{percent[r, j] / found[r, j]:.3g} %: fit recordings that move like it "
-        "as well, so that what is missing shows"
+        f"on the held-out recording {held_out.recordings.names[r]} the error of {label} is "
+        f"{percent[r, j]:.3g} %, of which noise and uncertain parameters explain "
+        f"{percent[r, j] / found[r, j]:.3g} %: also fit recordings with motions like this one"
     )
 
 
 def _power(filt: ARFilter, rest: Float[np.ndarray, " samples"]) -> float:
-    """Mean square of noise whose spectrum has the shape of a filter, at the level of a residual.
+    """Mean square of noise with the spectrum of a filter, at the level of a residual.
 
-    The level is the median over frequencies, which physics that a model lacks hardly moves: it is
-    slow, and has but few of them.
+    The level is the median over frequencies. A missing effect hardly changes the median, because it
+    is slow and concerns few frequencies.
     """
     white = filt.whiten(rest)[filt.order :]
     spectrum = np.abs(np.fft.rfft(white)[1:]) ** 2 / len(white)
@@ -279,7 +280,7 @@ def _spread(filt: ARFilter, samples: int) -> float:
 
 
 def _unsure(fit: Fit, held_out: Comparison) -> Float[np.ndarray, "recordings joints"]:
-    """Mean square error of held-out recordings that follows from deviations of the parameters."""
+    """Mean square error of held-out recordings due to the uncertainty of the parameters."""
     system = System.of(held_out)
     slopes = system.base[..., : len(fit.names)]
     if len(slopes) != len(held_out.residuals):

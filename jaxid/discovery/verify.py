@@ -1,4 +1,4 @@
-"""Sets of effects fitted as full nonlinear models."""
+"""Full nonlinear fits of models with sets of effects."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,17 +16,18 @@ from ..simulation.loop import ClosedLoop
 from .hypotheses import free_of
 from .likelihood import score_of
 
-# How much too wide a gap is from which a refit begins: where a link flies longest, all that its
-# contact has shows.
+# Factor on the gap at the start of another refit. In a wide gap the link moves freely for longer,
+# so that all parameters of the contact influence the motion.
 _WIDE = 10.0
-# How many times what it saves an effect must explain, for no refit without it to be tried.
+# Ratio of what an effect explains to its price above which no refit without it is made.
 _CERTAIN = 3.0
-# Gains that are so many times what was promised, or so many times less, are far from it.
+# Ratio of actual to predicted decrease of the score above which, or below whose inverse, the refit
+# is repeated from another start.
 _FAR = 2.0
 
 
 class Refits(eqx.Module):
-    """Refits on the same recordings by the same method, judged by the same score."""
+    """Fits on the same recordings by the same method, compared by the same score."""
 
     recordings: Recordings
     method: OEM
@@ -36,12 +37,12 @@ class Refits(eqx.Module):
         return fit(loop, self.recordings, quiet(self.method))
 
     def filtered(self, loop: ClosedLoop, noise: Sequence[ARFilter]) -> Fit:
-        """A fit from where the loop is, efficient where noise is coloured."""
+        """A fit with noise filters, from the loop's values; efficient for coloured noise."""
         method = SeparablePEM(self.given(), filters=tuple(noise))
         return fit(loop, self.recordings, method)
 
     def given(self) -> OEM:
-        """The output error to refit with, from where the loop is."""
+        """The output-error method that starts from the loop's values."""
         return dataclasses.replace(quiet(self.method), start="given")
 
     def with_effects(
@@ -51,16 +52,17 @@ class Refits(eqx.Module):
         noise: Sequence[ARFilter],
         promised: float = 0.0,
     ) -> Fit:
-        """The best refit of a fitted model with more effects in it, from several starts if need be.
+        """The best refit of a fitted model with additional effects, from several starts if needed.
 
-        Effects that part drive and link are far from what the linear system knows: noise filters
-        may bar the way to the minimum, so one refit begins without; and a contact whose stiffness
-        is held at a wrong value has many minima, so others begin with it free. What gains far from
-        what was promised is refitted from where white noise would have it as well.
+        The linear system predicts transmissions and limits least precisely. Noise filters can keep
+        their fit from the minimum, so another refit starts from a fit without filters. A contact
+        with a held stiffness has many local minima, so further refits start with the stiffness
+        free. If the score decreases much more or much less than predicted, the refit is repeated
+        from a fit that assumes white noise.
 
         **Arguments:**
 
-        - `promised`: how much the score should fall.
+        - `promised`: predicted decrease of the score.
         """
         loop = of_one_sign(before.loop.add(*map(_inside, effects)))
         starts = [loop]
@@ -86,28 +88,29 @@ class Refits(eqx.Module):
         return best
 
     def unfiltered(self, loop: ClosedLoop, noise: Sequence[ARFilter]) -> Fit:
-        """The loop fitted as if noise were white: filters that knew nothing of an effect bar it.
+        """The fit of the loop under the assumption of white noise.
 
-        Output error, by the program that filters need anyway.
+        Filters that were estimated without an effect can remove its torque from the comparison. The
+        compiled program is that of fits with filters.
         """
         return self.filtered(loop, [ARFilter(np.zeros(0), f.variance * f.gain) for f in noise])
 
     def best(self, found: Sequence[Fit]) -> Fit:
-        """The likeliest of several fits of one set of effects."""
+        """The fit with the lowest score, of several fits of one set of effects."""
         return min(found, key=lambda f: score_of(f).value)
 
 
 def quiet(method: OEM) -> OEM:
-    """The method without its lines of progress."""
+    """The method without its progress lines."""
     return dataclasses.replace(method, progress=False)
 
 
 def held_shapes(loop: ClosedLoop, last: int) -> tuple[str, ...]:
-    """Names of the last transmissions' parameters that no fit estimates unless told to.
+    """Names of parameters that are held by declaration, of transmissions among the last effects.
 
     **Arguments:**
 
-    - `last`: how many effects.
+    - `last`: number of last effects to consider.
     """
     first = len(loop.effects) - last
     return tuple(
@@ -121,9 +124,9 @@ def held_shapes(loop: ClosedLoop, last: int) -> tuple[str, ...]:
 
 
 def of_one_sign(loop: ClosedLoop) -> ClosedLoop:
-    """The loop with one smoothed sign per joint, where that of its Coulomb friction is estimated.
+    """The loop with one smoothing per joint, if that of its Coulomb friction is estimated.
 
-    Effects are added with the smoothing it had then, which may come out another beside them.
+    Effects are added with the current smoothing, and the refit may change that of the friction.
     """
     estimated, held = {}, []
     for p in loop.parameters:
@@ -138,7 +141,7 @@ def of_one_sign(loop: ClosedLoop) -> ClosedLoop:
 
 
 def _inside(effect: AbstractEffect) -> AbstractEffect:
-    """The effect with parameters that are on their bounds or beyond moved just inside."""
+    """The effect with parameters at or beyond their bounds moved just inside."""
     chosen = free_of(effect)
     if not chosen:
         return effect
@@ -147,11 +150,11 @@ def _inside(effect: AbstractEffect) -> AbstractEffect:
 
 
 def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
-    """Whether amplitudes are so far from nothing that no refit without the effect can be better.
+    """Whether amplitudes are so significant that a refit without the effect cannot be better.
 
     **Arguments:**
 
-    - `price`: what the search for effects costs in all.
+    - `price`: price of the choice of effects in the score.
     """
     place = next(k for k, e in enumerate(fit.loop.effects) if e is effect)
     at, own, count = 0, [], 0
@@ -164,13 +167,13 @@ def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
     if effect.finite or not own or not np.isfinite(covariance).all():
         return False
     values = fit.theta[own]
-    # The squared error that would be left more (Wald), against what would be saved.
+    # The increase of the squared error without the effect (Wald), and the decrease of the price.
     lost = float(values @ np.linalg.pinv(covariance) @ values)
     saved = count * np.log(sum(r.size for r in fit.residuals)) + price
     return bool(lost > _CERTAIN * saved)
 
 
 def is_there(found: Fit, before: Fit) -> bool:
-    """Whether anything of the effects that a refit has added shows in the recordings."""
+    """Whether the recordings determine a value of the effects that a refit has added."""
     new = [k for k, name in enumerate(found.names) if name not in before.names]
     return not new or bool(np.isfinite(found.std[new]).any())

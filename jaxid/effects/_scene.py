@@ -20,7 +20,7 @@ class Scene(eqx.Module):
     - `couplings`: pairs of joints that may share a shaft, and the turns of the shaft per turn of
       the first joint.
     - `moments`: first moments of each link in its own frame, kg·m; None if not known.
-    - `space`: joints and bodies of an arm in space; None for other arms.
+    - `space`: joints and bodies of a spatial arm; None for other arms.
     - `drawn`: whether its bodies are held at the values of a drawing.
     """
 

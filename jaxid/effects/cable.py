@@ -34,7 +34,7 @@ class CableDrag(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["CableDrag"]:
-        """Each pair of neighbouring turning joints, for arms in space."""
+        """Each pair of neighbouring turning joints, for spatial arms."""
         if scene.planar:
             return []
         turning = [not slides for slides in scene.slides]

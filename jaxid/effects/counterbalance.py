@@ -38,7 +38,7 @@ class Counterbalance(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["Counterbalance"]:
-        """Turning joints of an arm in space; angles over half a turn, because the sign is free."""
+        """Turning joints of a spatial arm; angles over half a turn, because the sign is free."""
         if scene.planar:
             return []
         angles = np.arange(8) * np.pi / 8 - np.pi / 2

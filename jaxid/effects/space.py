@@ -1,4 +1,4 @@
-"""Gravity and inertia loads of an arm in space: a tilted base, and a body carried at the tip."""
+"""Gravity and inertia loads of a spatial arm: a tilted base, and a body carried at the tip."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -43,7 +43,7 @@ class BaseTilt(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["BaseTilt"]:
-        """One instance for arms in space under gravity, with the slopes that affect torque."""
+        """One instance for spatial arms under gravity, with the slopes that affect torque."""
         if scene.space is None or not np.any(scene.space.chain.gravity):
             return []
         made = cls(scene.space.chain, scene.space.bodies)
@@ -94,7 +94,7 @@ def _slopes(effect: BaseTilt, q: Float[Array, "poses joints"]) -> Float[Array, "
 
 
 class CarriedBody(AbstractEffect):
-    """A body at the tip of an arm in space, on all or on named recordings.
+    """A body at the tip of a spatial arm, on all or on named recordings.
 
     Torque is linear in its ten parameters about the tip (Khalil, Dombre 2002). If it is on all
     recordings, it can be identified only if the parameters of the last link are held.
@@ -119,7 +119,7 @@ class CarriedBody(AbstractEffect):
 
     @classmethod
     def effect_name(cls) -> str:
-        """The name of a payload; this is its form for arms in space."""
+        """The name of a payload; this is its form for spatial arms."""
         return "payload"
 
     @classmethod
