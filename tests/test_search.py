@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections import Counter
+from types import SimpleNamespace
 
 import independent as sim
 import numpy as np
@@ -16,6 +17,7 @@ from jaxid.discovery.landscape import Entry, shares_a_joint
 from jaxid.discovery.likelihood import price, score, weights
 from jaxid.discovery.models import Model, Visited, probability
 from jaxid.discovery.score import Data
+from jaxid.discovery.search import Search
 from jaxid.discovery.verify import of_one_sign
 from jaxid.effects import (
     Backlash,
@@ -195,3 +197,20 @@ def test_a_load_that_drives_the_axis_into_its_limit_is_found():
     place = found.fit.names.index("payload")
     assert abs(found.fit.theta[place] - load.mass) < 4 * found.fit.std[place]
     assert found.loop.effects[-1].recordings == load.recordings
+
+
+def test_an_effect_that_a_curve_replaces_is_not_part_of_the_answer():
+    """The best model is a curve with one of two effects: the answer has that effect only, even if
+    it was never fitted alone.
+    """
+    spring, stribeck = Spring(joint=1), Stribeck(joint=2)
+    search = object.__new__(Search)
+    search.asked = SimpleNamespace(most=5)
+    search.at, search.visited = Model((spring, stribeck), score=-50.0), Visited()
+    curve = jaxid.effects.Curve(joint=2, coordinate="tau", of=2)
+    search.visited.add(Model((Spring(joint=1, stiffness=3.0),), score=-90.0, curve=curve, beyond=2))
+    asked = []
+    search.refitted = lambda at, effects: asked.append(effects) or Model(tuple(effects), -30.0)
+    assert search._verdict([], 0.0) == ("outside_catalogue", False)
+    assert asked == [[spring]]
+    assert search.at.effects[0] is spring

@@ -11,13 +11,14 @@ from ..errors import JaxidError
 from ..estimate import Filtering
 from ..estimate.idim import stack
 from ..estimate.regression import linear_parameters
+from ..estimate.result import DOUBTFUL_PERCENT
 from ..parameters import Bounds
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 
-# A mistake is named if correcting it reduces the squared error to less than this share, and leaves
-# an error below this, in %; a model of a robot leaves a smaller error.
-_SHARE, _LEAST = 0.25, 33.0
+# A mistake is named if its correction reduces the squared error to less than this share, and leaves
+# an error that is not doubtful.
+_SHARE = 0.25
 # Range of a long recording of white noise, in standard deviations.
 _STILL = 12.0
 # Factors between units that are often confused.
@@ -43,7 +44,7 @@ def likely_cause(loop: ClosedLoop, recordings: Recordings) -> str:
     found = []
     for said, mended in _mistakes(recordings):
         after = _left(loop, mended)
-        if after is not None and np.sqrt(np.mean(after**2)) < _LEAST:
+        if after is not None and np.sqrt(np.mean(after**2)) < DOUBTFUL_PERCENT:
             found.append((float(np.mean(after**2)), said))
     size, said = min(found, default=(np.inf, ""))
     if not size < _SHARE * np.mean(before**2):

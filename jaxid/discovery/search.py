@@ -19,7 +19,7 @@ from ..storage.campaign import Campaign
 from .asked import Asked
 from .diagnosis import Diagnosis, over_recordings, share_left
 from .explore import DECISIVE, Candidate, explore, key_of
-from .landscape import Landscape, forms_of
+from .landscape import Landscape, form, forms_of
 from .likelihood import price, score_of
 from .models import Model, Named, Visited, listed, piece_name
 from .ranking import Screened, judge
@@ -348,12 +348,25 @@ class Search:
             lambda m: m.curve is not None and set(key_of(m.effects)) < mine
         )
         if rivals and rivals[0].score < self.at.score - DECISIVE:
-            self.at = self.visited.fitted(rivals[0].effects) or self.at
+            self.at = self._part(rivals[0].effects)
             return "outside_catalogue", False
         if curved and curved[0].score == min(c.score for c in candidates):
             return "outside_catalogue", False
         left = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
         return ("explained" if self.at.effects else "adequate"), unfinished and bool(left)
+
+    def _part(self, effects: Sequence[AbstractEffect]) -> Model:
+        """The fit of a part of the chosen model's effects, which may come from a prediction."""
+        fitted = self.visited.fitted(effects)
+        if fitted is not None:
+            return fitted
+        left = Counter(map(form, effects))
+        part = []
+        for effect in self.at.effects:
+            if left[form(effect)] > 0:
+                left[form(effect)] -= 1
+                part.append(effect)
+        return self.refitted(self.at, part)
 
 
 def _released(loop: ClosedLoop) -> set[str]:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..estimate import Fit, Status
-from ..estimate.result import joint_columns
+from ..estimate.result import DOUBTFUL_PERCENT, joint_columns
 from ..noise import ARFilter
 from ..simulation.dynamics import imposed
 from .causes import likely_cause
@@ -29,9 +29,8 @@ _REFUTED = 1.10
 _BLURRED, _BLUR = 1.30, 1.0
 # Smallest significant excess, in standard deviations.
 _SURE = 4.0
-# Relative error of a joint's torque in % above which a model is useless, unless the residual is
-# white noise: ratio of the residual's power to that of its innovations above which it is not white.
-_THIRD, _COLOURED = 33.0, 1.5
+# Ratio of the residual's power to that of its innovations above which it is not white noise.
+_COLOURED = 1.5
 # Smallest probability of the starting model for the verdict `adequate`.
 _HALF = 0.5
 # Smallest significant increase of the error on held-out recordings, in standard deviations.
@@ -112,7 +111,7 @@ def _explains_little(fit: Fit, noise: Sequence[ARFilter]) -> str:
     """The reason if a third of a joint's torque is unexplained and not white noise."""
     left = over_recordings(fit.error_percent.to_numpy())
     for label, percent, filt in zip(joint_columns(fit.loop.joints), left, noise, strict=True):
-        if percent > _THIRD and filt.gain > _COLOURED:
+        if percent > DOUBTFUL_PERCENT and filt.gain > _COLOURED:
             return (
                 f"the error of {label} is {percent:.3g} %, and its residual is not white noise: "
                 f"{_to_check(fit)}"

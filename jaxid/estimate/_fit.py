@@ -18,7 +18,7 @@ from ..recording import Recording, Recordings, missing_after
 from ..simulation.batch import at_rest, check_joints, check_law
 from ..simulation.loop import ClosedLoop
 from .oem import OEM
-from .result import AbstractMethod, Fit, Status
+from .result import DOUBTFUL_PERCENT, AbstractMethod, Fit, Status
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,7 +54,7 @@ def fit(
         )
     if method.rigid:
         _check_rigid(loop, method)
-    found = _followed(_doubted(_honest(method.fit(loop, recordings))))
+    found = _followed(_doubted(_without_nan(method.fit(loop, recordings))))
     notes = (*found.notes, *_matter(found), *_band(loop, recordings), *_gaps(recordings))
     notes = (*notes, *_restarted(loop, recordings))
     return dataclasses.replace(found, notes=notes)
@@ -139,7 +139,7 @@ def _gaps(recordings: Recordings) -> list[str]:
     ]
 
 
-def _honest(found: Fit) -> Fit:
+def _without_nan(found: Fit) -> Fit:
     """The fit, marked as failed if it contains NaN.
 
     Infinite deviations are allowed for undetermined parameters.
@@ -155,10 +155,6 @@ def _honest(found: Fit) -> Fit:
         return found
     note = f"some of the {' and '.join(wrong)} are not numbers (NaN)"
     return dataclasses.replace(found, status=Status.overflowed, notes=(*found.notes, note))
-
-
-# Good models have an error of a few per cent, and noise is rarely above ten.
-_DOUBTFUL_PERCENT = 30.0
 
 
 def _doubted(found: Fit) -> Fit:
@@ -187,7 +183,7 @@ def doubtful_joints(found: Fit) -> dict[str, float]:
     errors = found.error_percent * _of_motion(found)
     largest = errors.to_numpy().max(axis=0)
     by_joint = {str(c): float(x) for c, x in zip(errors.columns, largest, strict=True)}
-    return {label: value for label, value in by_joint.items() if value > _DOUBTFUL_PERCENT}
+    return {label: value for label, value in by_joint.items() if value > DOUBTFUL_PERCENT}
 
 
 def _followed(found: Fit) -> Fit:

@@ -25,6 +25,11 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
 
 
+# Relative error of a joint's torque, %, above which a model is of no use. Good models have an error
+# of a few per cent, and noise is rarely above ten.
+DOUBTFUL_PERCENT = 30.0
+
+
 class Status(enum.Enum):
     """How a fit ended."""
 
