@@ -169,6 +169,31 @@ def test_initial_states_by_recording_are_found_with_the_parameters():
     np.testing.assert_allclose(found, scipys.x, rtol=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_small_jumps_of_the_loss_are_no_failure(seed):
+    """A rounded model, as of a law on an encoder: steps are refused near the minimum."""
+    rng = np.random.default_rng(seed)
+    a, true = rng.standard_normal((300, 3)), np.array([0.4, -1.0, 2.0])
+    data = 0.05 * np.round(a @ true / 0.05) + 0.2 * rng.standard_normal(300)
+
+    def rounded(y, args, slope=1.0):
+        z = a @ y[0]
+        jump = 0.05 * jnp.round(z / 0.05) - slope * z
+        return slope * z + jax.lax.stop_gradient(jump) - data
+
+    begin, solver = (jnp.zeros(3), nothing()), own_solver([-np.inf] * 3, [np.inf] * 3)
+    found = optx.least_squares(rounded, solver, begin, max_steps=300, throw=False)
+    assert found.result == optx.RESULTS.successful
+    best, *_ = np.linalg.lstsq(a, data, rcond=None)
+    deviation = 0.2 * np.sqrt(np.diag(np.linalg.inv(a.T @ a)))
+    assert np.all(np.abs(found.value[0] - best) < deviation)
+    # A derivative of the wrong sign is one: no step lowers the loss, far from the minimum.
+    wrong = optx.least_squares(
+        lambda y, args: rounded(y, args, slope=-1.0), solver, begin, max_steps=300, throw=False
+    )
+    assert wrong.result == optx.RESULTS.nonlinear_divergence
+
+
 # --- on a robot ---------------------------------------------------------------------------------
 
 

@@ -19,6 +19,9 @@ FULL = 1e10
 STEPS_JUDGED = 5
 # Damping above which a step is shorter than rounding.
 LARGEST_DAMPING = 1e12
+# A refused step with more than this damping could not have lowered the loss noticeably. If a full
+# step is also shorter than this many standard deviations, jumps of the loss hide the minimum.
+LARGE_DAMPING, NEAR = 1e4, 1.0
 
 
 class SolverState(eqx.Module):
@@ -60,6 +63,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     - `worth`: it also stops if five accepted steps together lower the loss by less than this share.
       With sticking friction the loss has kinks, at which full steps stay long without a decrease.
     - `rtol`, `atol`, `norm`: required by optimistix; they are not used.
+
+    A sampled law with quantised encoders makes the loss jump by small amounts. There it also stops
+    if damped steps are refused and a full step is shorter than one standard deviation.
     """
 
     descent: BoundedDescent
@@ -111,8 +117,10 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         diff, full = (jax.tree.map(lambda x, k=k: x[k], diffs) for k in (0, 1))
         # The predicted decrease of a full step is half its squared length in deviations times the
         # residual's variance.
-        settled = 2 * promised(full, f_info) <= self.tolerance**2 * losses[-1] / rows
+        decrease, variance = 2 * promised(full, f_info), losses[-1] / rows
+        settled = decrease <= self.tolerance**2 * variance
         flat = losses[0] - losses[-1] < self.worth * losses[-1]
+        hidden = ~accepted & (search.damping > LARGE_DAMPING) & (decrease <= NEAR**2 * variance)
         stuck = search.damping > LARGEST_DAMPING
         state = SolverState(
             y_eval=jax.tree.map(jnp.add, y, diff),
@@ -122,9 +130,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             losses=losses,
             search=search,
             descent=descent,
-            terminate=settled | flat | stuck,
+            terminate=settled | flat | hidden | stuck,
             result=optx.RESULTS.where(
-                stuck & ~settled & ~flat,
+                stuck & ~settled & ~flat & ~hidden,
                 optx.RESULTS.nonlinear_divergence,
                 optx.RESULTS.successful,
             ),
