@@ -3,6 +3,7 @@
 import dataclasses
 import html
 import os
+import textwrap
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -28,7 +29,7 @@ from .floor import SPOKEN
 from .hypotheses import effect_on, on_recordings
 from .landscape import form
 from .models import Model, models_table, named, picked
-from .text import errors_table, models_lines, wrapped
+from .text import WIDTH, errors_table, models_lines, wrapped
 from .verdict import Outcome
 from .verify import Refits
 
@@ -105,12 +106,20 @@ class Discovery(AbstractShown):
     @property
     def sentence(self) -> str:
         """The verdict in a sentence for a colleague."""
-        added = _spoken(self.steps)
+        return self._said(_spoken(self.steps))
+
+    @property
+    def headline(self) -> str:
+        """The verdict in a sentence, without the probabilities of the added effects."""
+        return self._said(_spoken(self.steps, sure=False))
+
+    def _said(self, effects: Sequence[str]) -> str:
+        added = _joined(effects)
         if self.interrupted:
-            so_far = f"adds {' and '.join(added)}" if added else "is the starting model"
+            so_far = f"adds {added}" if added else "is the starting model"
             return f"The search was interrupted: the best model until then {so_far}."
         if self.verdict == "undetermined":
-            best = f"the best model adds {' and '.join(added)}, but " if added else ""
+            best = f"the best model adds {added}, but " if added else ""
             return (
                 f"These recordings do not tell what the model of {self.loop.name} lacks: "
                 f"{best}{self.reason}."
@@ -124,12 +133,12 @@ class Discovery(AbstractShown):
             )
         if self.unfinished:
             return (
-                f"The model lacked {' and '.join(added)}, and is still incomplete: the search was "
-                "told to stop there."
+                f"The model lacked {added}, and is still incomplete: the search was told to stop "
+                "there."
             )
         if self.verdict == "explained":
-            return f"The model lacked {' and '.join(added)}; with that, nothing is left to explain."
-        lacked = f"The model lacked {' and '.join(added)}; " if added else ""
+            return f"The model lacked {added}; with that, nothing is left to explain."
+        lacked = f"The model lacked {added}; " if added else ""
         if not self.diagnosis.depends_on():
             return _upper(f"{lacked}no effect of the catalogue explains what is left.")
         hypothesis = self.diagnosis.where[0].hypothesis
@@ -350,7 +359,7 @@ class Discovery(AbstractShown):
             for s in self.steps
         ]
         lines = [
-            f"{self.verdict}: {self.sentence}",
+            *textwrap.wrap(f"{self.verdict}: {self.sentence}", WIDTH, break_on_hyphens=False),
             "",
             *errors_table(steps, self.noise_floor_percent().tolist()),
             *(x for line in self._floor_sources() for x in wrapped(line)),
@@ -358,7 +367,8 @@ class Discovery(AbstractShown):
         found = self._found()
         lines += ["", *(x for line in found for x in wrapped(line))] if found else []
         if len(self.considered) > 1:
-            lines += ["", *models_lines(self.considered)]
+            final = tuple(s.added for s in self.steps if s.added is not None)
+            lines += ["", *models_lines(self.considered, final)]
         return "\n".join([*lines, *(x for note in self.notes for x in wrapped(note))])
 
     def _found(self) -> list[str]:
@@ -403,14 +413,19 @@ def _upper(sentence: str) -> str:
     return sentence[:1].upper() + sentence[1:]
 
 
-def _spoken(steps: Sequence[Step]) -> list[str]:
-    """Added effects in words with their probabilities; repeated effects are named once."""
+def _joined(words: Sequence[str]) -> str:
+    """A list in a sentence: `a, b and c`."""
+    return " and ".join(x for x in (", ".join(words[:-1]), *words[-1:]) if x)
+
+
+def _spoken(steps: Sequence[Step], sure: bool = True) -> list[str]:
+    """Added effects in words, with their probabilities if `sure`; repeated ones are named once."""
     added = [(step.added, step.probability) for step in steps if step.added is not None]
     counted = Counter(_placed(e.spoken(), e) for e, _ in added)
-    sure = {_placed(e.spoken(), e): odds(share) for e, share in added}
+    shares = {_placed(e.spoken(), e): odds(share) for e, share in added}
     often = {1: "", 2: " twice"}
     return [
-        f"{name}{often.get(n, f' {n} times')} (probability {sure[name]})"
+        f"{name}{often.get(n, f' {n} times')}{f' (probability {shares[name]})' * sure}"
         for name, n in counted.items()
     ]
 
