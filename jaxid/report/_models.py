@@ -30,7 +30,7 @@ def models(story: Discovery) -> Markup:
     if story.considered:
         pieces.append(_weights(story))
     for before, step in zip(story.steps, story.steps[1:], strict=False):
-        pieces += [tag("h3", breakable(step.label)), tag("p", _reason(before.diagnosis, step))]
+        pieces += [tag("h3", step.label), tag("p", _reason(before.diagnosis, step))]
         pieces.append(_alike(step))
     for name, joint in story.removed:
         said = f"{effect_on(name, joint)} was added and removed later, because it is not needed."
