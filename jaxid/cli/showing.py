@@ -2,7 +2,6 @@
 
 import os
 import sys
-import textwrap
 from typing import Any
 
 import typer
@@ -21,18 +20,20 @@ def pooled(result: Any) -> dict[str, float]:
 
 def tell(story: Any, quiet: bool = False) -> None:
     """Prints a discovery: its verdict, and all of it unless `quiet`."""
-    verdict, _, rest = repr(story).partition("\n")
+    verdict, _, rest = repr(story).partition("\n\n")
     colour = "green" if story.verdict in ("adequate", "explained") else "yellow"
     if quiet:
-        say(verdict, bold=True, fg=colour)
+        say(f"{story.verdict}: {story.sentence}", bold=True, fg=colour)
     else:
-        say(textwrap.fill(verdict, 80, break_on_hyphens=False), bold=True, fg=colour)
-        typer.echo(rest)
+        say(verdict, bold=True, fg=colour)
+        typer.echo(f"\n{rest}")
 
 
 LEGEND = """
-relative error: norm of measured minus simulated torque, over norm of measured torque
-fit, held out:  recordings that were fitted, and one that was not
+relative error: norm of measured minus simulated torque, divided by the norm of
+                the measured torque
+fitted:         on recordings that were used in the fit
+held out:       on a recording that was not
 noise floor:    the error that a perfect model would leave
 ±:              one standard deviation"""
 

@@ -155,8 +155,10 @@ def _raised(search: Search, steps: Sequence[Step]) -> str:
         return ""
     pairs = itertools.pairwise(seen)
     culprits = [label for (_, one), (label, other) in pairs if risen(one, other, noise)]
+    # All effects together say nothing that the reason does not say.
+    some = 0 < len(culprits) < len(seen) - 1
     said = f"; it rose with {' and '.join(x.removeprefix('+ ') for x in culprits)}"
-    return reason + (said if culprits else "")
+    return reason + said * some
 
 
 def _held_out(search: Search, models: Sequence[Model], steps: Sequence[Step]) -> tuple[Model, ...]:

@@ -199,7 +199,7 @@ class Diagnosis(AbstractShown):
             ]
             rows_of = zip(shown or [("setting", "1")], values, stds, strict=True)
             size = ", ".join(
-                f"{s} {v:.3g} ± {d:.1g}{'' if unit == '1' else f' {unit}'}"
+                f"{s} {_digits(v, 3)} ± {_digits(d, 1)}{'' if unit == '1' else f' {unit}'}"
                 for (s, unit), v, d in rows_of
             )
             error = self.predicted_error(verdict) if verdict.p_value < 0.05 else None
@@ -398,3 +398,8 @@ def over_recordings(
 ) -> Float[np.ndarray, " joints"]:
     """Root mean square of the relative errors of several recordings, one per joint, %."""
     return np.sqrt(np.mean(percent**2, axis=0))
+
+
+def _digits(value: float, digits: int) -> str:
+    """A number rounded to a number of digits; up to a million without an exponent."""
+    return f"{float(f'{value:.{digits}g}'):g}"

@@ -22,6 +22,7 @@ from .diagnosis import over_recordings
 from .hypotheses import effect_on
 from .landscape import form
 from .likelihood import noise_filters, score_of
+from .text import wrapped
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -111,26 +112,36 @@ class ModelDifference(AbstractShown):
         }
 
     def __repr__(self) -> str:
-        table = self.table().to_string(float_format=lambda x: f"{x:.4g}")
-        return "\n".join([*self._head(), table])
+        lines = [x for line in self._head() for x in wrapped(line)]
+        return "\n".join([*lines, "", self._rows().to_string()])
 
     def _repr_html_(self) -> str:
         head = "".join(f"<p>{html.escape(line)}</p>" for line in self._head())
-        return f"{head}{self.table().to_html(float_format='%.4g')}"
+        return f"{head}{self._rows().to_html()}"
 
     def _head(self) -> list[str]:
-        lines = [f"first: {self.names[0]}", f"second: {self.names[1]}"]
+        lines = [f"first:  {self.names[0]}", f"second: {self.names[1]}"]
         if self.score is not None:
-            low, high = self.score.interval
-            verdict = "not distinguished"
-            if self.score.sure:
-                verdict = f"the {'first' if self.score.value < 0 else 'second'} is better"
             lines.append(
-                f"score, first minus second: {self.score.value:.1f} ({low:.1f} to {high:.1f}): "
-                f"{verdict}"
+                f"score, first minus second: {self.score.value:.1f} ({_interval(self.score, 1)}): "
+                f"{_better(self.score)}"
             )
-        lines.append(f"on {', '.join(self.first.recordings.names)}, with 95 % intervals:")
+        names = ", ".join(self.first.recordings.names)
+        lines.append(f"relative error on {names}, %, and first minus second, with 95 % intervals:")
         return lines
+
+    def _rows(self) -> "pd.DataFrame":
+        """The table as text."""
+        import pandas as pd
+
+        table, joints = self.table(), self.errors
+        columns = {
+            **{name: [f"{x:.3f}" for x in table[name]] for name in ("first", "second")},
+            "difference": [f"{x.value:+.3f}" for x in joints],
+            "95 % interval": [_interval(x, 3) for x in joints],
+            "": [_better(x) for x in joints],
+        }
+        return pd.DataFrame(columns, index=table.index.rename(None))
 
 
 def compare_models(
@@ -175,6 +186,18 @@ def compare_models(
     score = None if shared is None else _score_change(*shared)
     names = _names(one.loop, other.loop)
     return ModelDifference(names, one, other, score, _error_changes(one, other))
+
+
+def _better(change: Change) -> str:
+    """The better model in words; smaller scores and errors are better."""
+    if not change.sure:
+        return "not distinguished"
+    return f"the {'first' if change.value < 0 else 'second'} is better"
+
+
+def _interval(change: Change, digits: int) -> str:
+    low, high = change.interval
+    return f"{low:.{digits}f} to {high:.{digits}f}"
 
 
 def _shared(first: Model, second: Model) -> tuple[Fit, Fit] | None:

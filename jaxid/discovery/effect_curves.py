@@ -2,6 +2,7 @@
 
 import dataclasses
 import html
+import textwrap
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from ..simulation.loop import ClosedLoop
 from .comparison import Comparison, compare
 from .hypotheses import effect_on
 from .signatures import Placed, force_and_slopes, left_for_links
+from .text import WIDTH
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
 _ALL = 0.98
 # A coordinate later in the list must explain this additional share of the torque.
 _MORE = 0.01
+# The same for a coordinate of another joint: along few recordings it may be like one of the own.
+_OTHER = 0.1
 # Time is not considered if another coordinate explains more than this share.
 _HALF = 0.5
 _COARSE, _FINE = 30, 100
@@ -62,6 +66,11 @@ class EffectCurve(AbstractShown):
     cloud: Float[np.ndarray, " samples"] | None = None
 
     @property
+    def sensed(self) -> bool:
+        """Whether the effect changes a sensor's reading, and the curve is that change."""
+        return _sensed(self.effect)
+
+    @property
     def name(self) -> str:
         """The effect with its joint, in words."""
         return effect_on(self.effect.spoken(), self.joint)
@@ -71,9 +80,15 @@ class EffectCurve(AbstractShown):
         import pandas as pd
 
         half = _WIDE * self.std
-        columns = {"std": self.std, "low": self.torque - half, "high": self.torque + half}
+        what = "reading" if self.sensed else "torque"
+        columns = {
+            f"{what} ({self.units[1]})": self.torque,
+            "std": self.std,
+            "low": self.torque - half,
+            "high": self.torque + half,
+        }
         index = pd.Index(self.x, name=f"{self.coordinate} ({self.units[0]})")
-        return pd.DataFrame({f"torque ({self.units[1]})": self.torque, **columns}, index=index)
+        return pd.DataFrame(columns, index=index)
 
     def plot(self) -> "go.Figure":
         """The curve with its 95 % band over the residual of the model without the effect."""
@@ -89,9 +104,14 @@ class EffectCurve(AbstractShown):
             self.x,
             self.torque,
             _WIDE * self.std if np.isfinite(self.std).all() else None,
-            y_name=("residual without it" if self.cloud is not None else "effect") + times,
+            y_name=self._axis() + times,
             curve_name=self.name,
         )
+
+    def _axis(self) -> str:
+        if self.cloud is not None:
+            return "residual without effect"
+        return "change of the position reading" if self.sensed else "torque of the effect"
 
     def to_dict(self) -> dict[str, Any]:
         """The curve as plain JSON."""
@@ -109,7 +129,8 @@ class EffectCurve(AbstractShown):
         }
 
     def __repr__(self) -> str:
-        return f"{self._head()}\n{self._rows().to_string(float_format=self._digits())}"
+        head = textwrap.fill(self._head(), WIDTH)
+        return f"{head}\n\n{self._rows().to_string(float_format=self._digits())}"
 
     def _repr_html_(self) -> str:
         table = self._rows().to_html(float_format=self._digits())
@@ -117,7 +138,9 @@ class EffectCurve(AbstractShown):
 
     def _rows(self) -> "pd.DataFrame":
         """Rows that fit on a screen; the table has all rows."""
-        return self.table().iloc[:: max(1, len(self.x) // 20)]
+        rows = self.table().iloc[:: max(1, len(self.x) // 20)]
+        rows.index = rows.index.map(lambda x: f"{x:.4g}")
+        return rows
 
     def _digits(self) -> Callable[[float], str]:
         """Four digits of the largest torque."""
@@ -127,8 +150,14 @@ class EffectCurve(AbstractShown):
 
     def _head(self) -> str:
         times = ", times the sign of velocity" if self.signed else ""
-        shown = f"{100 * self.share:.0f} % of its torque"
-        return f"{self.name}: torque over {self.coordinate}{times} ({shown})"
+        what = "change of the reading" if self.sensed else "torque"
+        head = (
+            f"{self.name}: {what} over the {self.coordinate}{times}, with its standard deviation "
+            "(std) and its 95 % interval (low to high)."
+        )
+        if self.share < _ALL:
+            head += f" The curve shows {100 * self.share:.0f} % of it."
+        return f"{head} The table has {len(self.x)} rows."
 
 
 def effect_curve(
@@ -235,10 +264,14 @@ def _own(loop: ClosedLoop, place: int, motion: Motion) -> tuple[np.ndarray, np.n
     left = left_for_links(_without(loop, place), motion)
     fields = tuple(str(p.place[-1]) for p in _parameters(loop, place))
     push, noise, _ = force_and_slopes(Placed.of(effect, loop.joints), motion, left, fields)
-    sensed = type(effect).read is not AbstractEffect.read
+    sensed = _sensed(effect)
     # The sign changes, because torque that the effect adds to the joint relieves the drive.
     found = np.asarray(noise) if sensed else -np.asarray(push)
     return found[..., 0], found[..., 1:], sensed
+
+
+def _sensed(effect: AbstractEffect) -> bool:
+    return type(effect).read is not AbstractEffect.read
 
 
 def _without(loop: ClosedLoop, place: int) -> ClosedLoop:
@@ -264,7 +297,9 @@ def _coordinate(
 ) -> tuple[Curve, float]:
     """The coordinate that explains most of a torque, and the share that it explains."""
     joints = [joint, *(j for j in range(1, motion.q.shape[-1] + 1) if j != joint)]
-    names = [(c, j) for j in joints for c in ("v", "q", "tau", "a")]
+    # A sensor's error depends on the position that it reads.
+    order = ("q", "v", "tau", "a") if _sensed(effect) else ("v", "q", "tau", "a")
+    names = [(c, j) for j in joints for c in order]
     found = [
         Curve(joint=joint, coordinate=c, of=j, signed=signed)  # type: ignore[arg-type]
         for signed in (False, True)
@@ -285,7 +320,8 @@ def _coordinate(
         # Along one recording every torque is a smooth function of time.
         if over.coordinate == "t" and share > _HALF:
             continue
-        if shown > share + _MORE:
+        other = best.of == joint and over.coordinate != "t" and over.of != joint
+        if shown > share + (_OTHER if other else _MORE):
             best, share = over, shown
     return best, float(share)
 

@@ -93,7 +93,8 @@ def explore(
         for effects in _moves(landscape, seen, at, most):
             if key_of(effects) in seen or shares_a_joint(effects):
                 continue
-            say(f"set {len(seen)}: {', '.join(e.effect_name() for e in effects)}")
+            said = ", ".join(e.effect_name() for e in effects)
+            say(f"prediction of model {len(seen)}: with {said}")
             found = _candidate(landscape, landscape.predictor.predict(effects))
             seen[key_of(effects)] = found
         for curved in _with_curves(landscape, at):

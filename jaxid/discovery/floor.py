@@ -17,7 +17,7 @@ from ..simulation.loop import ClosedLoop
 SPOKEN = {
     "repeats": "from recordings that repeat a reference",
     "above the motion": "from the torque above the motion's frequencies",
-    "rich model": "from a model with every effect that matters",
+    "rich model": "from the residual of a model with all effects that matter",
 }
 
 

@@ -77,11 +77,26 @@ class Model(eqx.Module):
     @property
     def label(self) -> str:
         """Its additions to the starting model, in words."""
-        parts = [effect_on(*named(e)) for e in self.effects]
+        return " + ".join(self._parts(self.names)) or "start"
+
+    def label_beside(self, final: Sequence[AbstractEffect]) -> str:
+        """The label, in which several effects of the final model are called `final`.
+
+        **Arguments:**
+
+        - `final`: the effects of the final model.
+        """
+        known, own = Counter(map(named, final)), Counter(self.names)
+        if len(final) < 2 or known - own:
+            return self.label
+        return " + ".join(["final", *self._parts(tuple((own - known).elements()))])
+
+    def _parts(self, names: Sequence[Named]) -> list[str]:
+        parts = [effect_on(*name) for name in names]
         if self.curve is not None:
             along = f"{self.curve.label}{' and direction' if self.curve.signed else ''}"
             parts.append(f"curve of {along} on joint {self.curve.joint}")
-        return " + ".join(parts) or "start"
+        return parts
 
     def to_dict(self, best: float) -> dict[str, Any]:
         """The model as plain JSON.

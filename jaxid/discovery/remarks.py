@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from ..effects import ActuatorLag, TimeDelay
 from ..estimate import Fit
 from ..simulation.loop import ClosedLoop
@@ -30,9 +32,11 @@ def _estimated(fit: Fit, given: ClosedLoop) -> list[str]:
         if p.place in held:
             before, row = float(held[p.place].where(given)), fit.table().loc[p.name]
             unit = "" if row["unit"] == "1" else f" {row['unit']}"
+            std = f" ± {row['std']:.2g}" if np.isfinite(row["std"]) else ""
+            unsure = "" if std else ", and do not determine it"
             found.append(
-                f"{p.name} was estimated, {row['value']:.3g} ± {row['std']:.2g}{unit}: these "
-                f"recordings contradict its default value of {before:.3g}"
+                f"{p.name} was estimated, {row['value']:.3g}{std}{unit}: these recordings "
+                f"contradict its default value of {before:.3g}{unsure}"
             )
     before, after = (getattr(x.controller, "delay", 0.0) for x in (given, fit.loop))
     if after != before and fit.loop.controller.imposes:

@@ -44,14 +44,14 @@ def odds(share: float) -> str:
     return "> 0.999" if share > 0.999 else f"{share:.3g}"
 
 
-def added_in_words(steps: Sequence[Step]) -> list[str]:
-    """Added effects in words with their probabilities; repeated effects are named once."""
+def added_in_words(steps: Sequence[Step], sure: bool = True) -> list[str]:
+    """Added effects in words, with their probabilities if `sure`; repeated ones are named once."""
     added = [(step.added, step.probability) for step in steps if step.added is not None]
     counted = Counter(_placed(e.spoken(), e) for e, _ in added)
-    sure = {_placed(e.spoken(), e): odds(share) for e, share in added}
+    shares = {_placed(e.spoken(), e): odds(share) for e, share in added}
     often = {1: "", 2: " twice"}
     return [
-        f"{name}{often.get(n, f' {n} times')} (probability {sure[name]})"
+        f"{name}{often.get(n, f' {n} times')}{f' (probability {shares[name]})' * sure}"
         for name, n in counted.items()
     ]
 

@@ -3,8 +3,9 @@
 import dataclasses
 import html
 import os
+import textwrap
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,7 @@ from .hypotheses import effect_on
 from .landscape import form
 from .models import Model, models_table, named, picked
 from .step import Step, added_in_words, errors_of, found_parameters, joint_errors, odds, step_name
-from .text import errors_table, models_lines, wrapped
+from .text import WIDTH, errors_table, joined, models_lines, wrapped
 from .verdict import Outcome
 from .verify import Refits
 
@@ -93,12 +94,20 @@ class Discovery(AbstractShown):
     @property
     def sentence(self) -> str:
         """The verdict in a sentence for a colleague."""
-        added = added_in_words(self.steps)
+        return self._said(added_in_words(self.steps))
+
+    @property
+    def headline(self) -> str:
+        """The verdict in a sentence, without the probabilities of the added effects."""
+        return self._said(added_in_words(self.steps, sure=False))
+
+    def _said(self, effects: Sequence[str]) -> str:
+        added = joined(effects)
         if self.interrupted:
-            so_far = f"adds {' and '.join(added)}" if added else "is the starting model"
+            so_far = f"adds {added}" if added else "is the starting model"
             return f"The search was interrupted: the best model until then {so_far}."
         if self.verdict == "undetermined":
-            best = f"the best model adds {' and '.join(added)}, but " if added else ""
+            best = f"the best model adds {added}, but " if added else ""
             return (
                 f"These recordings do not tell what the model of {self.loop.name} lacks: "
                 f"{best}{self.reason}."
@@ -112,12 +121,12 @@ class Discovery(AbstractShown):
             )
         if self.unfinished:
             return (
-                f"The model lacked {' and '.join(added)}, and is still incomplete: the search was "
-                "told to stop there."
+                f"The model lacked {added}, and is still incomplete: the search was told to stop "
+                "there."
             )
         if self.verdict == "explained":
-            return f"The model lacked {' and '.join(added)}; with that, nothing is left to explain."
-        lacked = f"The model lacked {' and '.join(added)}; " if added else ""
+            return f"The model lacked {added}; with that, nothing is left to explain."
+        lacked = f"The model lacked {added}; " if added else ""
         if not self.diagnosis.depends_on():
             return _upper(f"{lacked}no effect of the catalogue explains what is left.")
         hypothesis = self.diagnosis.where[0].hypothesis
@@ -345,7 +354,7 @@ class Discovery(AbstractShown):
             for s in self.steps
         ]
         lines = [
-            f"{self.verdict}: {self.sentence}",
+            *textwrap.wrap(f"{self.verdict}: {self.sentence}", WIDTH, break_on_hyphens=False),
             "",
             *errors_table(steps, self.noise_floor_percent().tolist()),
             *(x for line in self._floor_sources() for x in wrapped(line)),
@@ -353,7 +362,8 @@ class Discovery(AbstractShown):
         found = self._found()
         lines += ["", *(x for line in found for x in wrapped(line))] if found else []
         if len(self.considered) > 1:
-            lines += ["", *models_lines(self.considered)]
+            final = tuple(s.added for s in self.steps if s.added is not None)
+            lines += ["", *models_lines(self.considered, final)]
         return "\n".join([*lines, *(x for note in self.notes for x in wrapped(note))])
 
     def _found(self) -> list[str]:

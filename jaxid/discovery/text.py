@@ -5,11 +5,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..effects import AbstractEffect
 from .models import Model
 
 WIDTH = 80
 # Joints per table; characters of a number; number of listed models.
 _JOINTS, _NUMBER, _MODELS = 6, 9, 8
+
+
+def joined(words: Sequence[str]) -> str:
+    """A list in a sentence: `a, b and c`."""
+    return " and ".join(x for x in (", ".join(words[:-1]), *words[-1:]) if x)
 
 
 def wrapped(text: str) -> list[str]:
@@ -47,19 +53,25 @@ def errors_table(
     return lines
 
 
-def models_lines(models: Sequence[Model]) -> list[str]:
+def models_lines(models: Sequence[Model], final: Sequence[AbstractEffect] = ()) -> list[str]:
     """The best models by their row in the table of models, with the starting model.
 
     Errors are those of the worst joint; `~` marks predictions.
+
+    **Arguments:**
+
+    - `final`: the effects of the final model, which are named together if there are several.
     """
     numbered = list(enumerate(models))
     shown = [(k, m) for k, m in numbered if k < _MODELS or m.label == "start"]
-    widths = (12, 8, 10, 10)
+    widths = (11, 8, 10, 10)
     left = WIDTH - sum(widths) - 4
     heads = ("difference", "weight", "fitted,%", "held out")
     lines = [f"{'row':<4}{'model':<{left}}" + _cells(heads, widths)]
     for k, m in shown:
-        *above, last = textwrap.wrap(m.label, left - 1, subsequent_indent="  ")
+        # A joint's number stays with its word.
+        label = m.label_beside(final).replace("joint ", "joint\u00a0")
+        *above, last = textwrap.wrap(label, left - 1, subsequent_indent="  ")
         mark = "" if m.fit is not None else "~"
         cells = (
             f"{m.score - models[0].score:.1f}",
@@ -69,11 +81,17 @@ def models_lines(models: Sequence[Model]) -> list[str]:
         )
         numbers = [str(k), *("" for _ in above)]
         names = [f"{no:<4}{name}" for no, name in zip(numbers, (*above, last), strict=True)]
-        lines += [*names[:-1], f"{names[-1]:<{left + 4}}" + _cells(cells, widths)]
-    return [
-        *lines,
-        "errors of the worst joint; ~ predicted, story.choose(row) fits it in full",
-    ]
+        numbers_of = f"{names[-1]:<{left + 4}}" + _cells(cells, widths)
+        lines += [line.replace("\u00a0", " ").rstrip() for line in (*names[:-1], numbers_of)]
+    legend = ["difference: of the score from the best model; a difference of ten is decisive"]
+    legend += ["errors of the worst joint; ~ predicted, story.choose(row) fits it in full"]
+    if any("final" in m.label_beside(final).split() for _, m in shown):
+        legend += ["final: the model with all added effects"]
+    curves = [m.curve for _, m in shown if m.curve is not None]
+    if curves:
+        said = "; ".join(dict.fromkeys(f"{c.label}: {c.spoken_coordinate}" for c in curves))
+        legend += wrapped(f"curve of ...: free-form function of a coordinate; {said}")
+    return [*lines, *legend]
 
 
 def _cells(cells: Sequence[str], widths: Sequence[int]) -> str:

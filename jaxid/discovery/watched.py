@@ -46,4 +46,6 @@ class Watched:
         self._labels.append(model.label)
         self._errors.append(model.left)
         errors = {"fitted": np.stack(self._errors)}
-        self._draw(lambda: figures.error_falling(self._labels, errors, title="model by model"))
+        self._draw(
+            lambda: figures.error_falling(self._labels, errors, title="error of each fitted model")
+        )

@@ -122,10 +122,12 @@ def _restarted(loop: ClosedLoop, recordings: Recordings) -> list[str]:
     moving = [r.name for r in recordings if not at_rest(r)]
     if not moving or not sum(leaf.size for leaf in own):
         return []
+    many = f"{len(moving)} of {len(recordings)} recordings begin in motion, such as {moving[0]}"
+    one = f"{moving[0]} begins in motion"
     return [
-        f"{len(moving)} of {len(recordings)} recordings, {moving[0]} the first, begin in motion, "
-        f"and the states of {type(law).__name__} with them as at its start (an integral at zero): "
-        "begin a recording where the law is switched on, or where the arm has been at rest"
+        f"{one if len(recordings) == 1 else many}: {type(law).__name__} is simulated as if it were "
+        "switched on there, with integrals at zero; begin a recording where the law is switched "
+        "on, or where the arm has been at rest"
     ]
 
 

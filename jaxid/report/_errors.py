@@ -12,7 +12,7 @@ from ..effects import Curve
 from ..effects.curve import coordinate_unit
 from ..noise import autocorrelation
 from ._beside import Beside
-from ._html import Content, Markup, cell, figure, join, section, table, tag
+from ._html import Content, Markup, breakable, cell, figure, join, section, table, tag
 from ._models import where_table
 from ._signals import misfits
 
@@ -30,8 +30,8 @@ def errors(beside: Beside) -> Markup:
     if beside.unseen:
         held = [s.held_out.error_percent.to_numpy() for s in story.steps if s.held_out is not None]
         rows += _rows("held out", beside.after.recordings.names, held, beside.floor)
-    steps = [step.label for step in story.steps]
-    columns = ["recording", "joint", *steps, "noise floor", "last over floor"]
+    steps = [breakable(step.label) for step in story.steps]
+    columns: list[Content] = ["recording", "joint", *steps, "noise floor", "last over floor"]
     said = (
         "Norm of measured minus simulated signal over norm of measured signal, in %, for each "
         "step. The noise floor is the error that a perfect model would leave, as estimated on the "
@@ -51,7 +51,8 @@ def _rows(
             ratio = values[-1] / max(by_noise, 1e-12)
             shown = [cell(f"{x:.2f}", x) for x in (*values, by_noise)]
             last = cell(f"{ratio:.2f}", ratio, f"number {'good' if ratio < NEAR else 'bad'}")
-            rows.append([join(name, tag("small", f" {used}")), j + 1, *shown, last])
+            small = tag("small", f" {used}".replace("held out", "held\u00a0out"))
+            rows.append([join(name, small), j + 1, *shown, last])
     return rows
 
 

@@ -17,6 +17,7 @@ class Cell(Markup):
 
 
 Content = str | int | float | None
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def tag(name: str, *content: Content, **attributes: Content) -> Markup:
@@ -40,7 +41,7 @@ def join(*content: Content) -> Markup:
 
 
 def table(
-    columns: Sequence[str], rows: Sequence[Sequence[Content]], caption: str | None = None
+    columns: Sequence[Content], rows: Sequence[Sequence[Content]], caption: str | None = None
 ) -> Markup:
     """A table whose columns sort on a click, by the numbers before rounding."""
     buttons = (tag("button", name, type="button") for name in columns)
@@ -73,10 +74,13 @@ def bar(shown: Content, value: float, share: float) -> Cell:
 
 
 def number(value: float) -> str:
-    """A number formatted with four digits; a dash for NaN."""
+    """A number formatted with four digits, a count with all; a dash for NaN."""
     if not math.isfinite(value):
         return "–" if math.isnan(value) else ("∞" if value > 0 else "−∞")
-    return f"{value:.4g}".replace("-", "−")
+    shown = f"{value:.4g}"
+    if 1e4 <= abs(value) < 1e6:
+        shown = f"{value if isinstance(value, int) else float(shown):.0f}"
+    return shown.replace("-", "−")
 
 
 def with_deviation(value: float, std: float | None) -> str:
@@ -84,7 +88,12 @@ def with_deviation(value: float, std: float | None) -> str:
     if std is None or not math.isfinite(std) or std <= 0:
         return number(value)
     digits = 1 - math.floor(math.log10(std))
-    if not 0 <= digits <= 6:
+    if digits > 6:
+        power = math.floor(math.log10(max(abs(value), std)))
+        places = max(digits + power, 0)
+        pair = "\u00a0±\u00a0".join(f"{x / 10.0**power:.{places}f}" for x in (value, std))
+        return f"({pair})·10{str(power).translate(SUPERSCRIPTS)}".replace("-", "−")
+    if digits < 0:
         return f"{number(value)}\u00a0±\u00a0{number(float(f'{std:.2g}'))}"
     return f"{value:.{digits}f}\u00a0±\u00a0{std:.{digits}f}".replace("-", "−")
 
@@ -92,6 +101,12 @@ def with_deviation(value: float, std: float | None) -> str:
 def percent(share: float) -> str:
     """A percentage with three digits."""
     return f"{share:.{2 if share < 10 else 1 if share < 100 else 0}f}"
+
+
+def breakable(name: str) -> Markup:
+    """A name whose lines may break after an underscore, but not before a joint's number."""
+    parts = name.replace("joint ", "joint\u00a0").replace("+ ", "+\u00a0").split("_")
+    return Markup("_<wbr>".join(join(part) for part in parts))
 
 
 def probability(p: float) -> str:

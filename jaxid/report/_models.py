@@ -5,8 +5,21 @@ import numpy as np
 from ..discovery import Discovery
 from ..discovery.diagnosis import Diagnosis, Verdict
 from ..discovery.hypotheses import effect_on
+from ..discovery.models import listed
 from ..discovery.step import Step, odds, step_name
-from ._html import Content, Markup, bar, cell, details, probability, section, table, tag
+from ._html import (
+    Content,
+    Markup,
+    bar,
+    breakable,
+    cell,
+    details,
+    join,
+    probability,
+    section,
+    table,
+    tag,
+)
 
 SHOWN = 12
 
@@ -30,10 +43,11 @@ def models(story: Discovery) -> Markup:
 
 def _weights(story: Discovery) -> Markup:
     best = story.considered[0].score
+    final = [step.added for step in story.steps if step.added is not None]
     rows = [
         [
-            m.label,
-            bar(odds(m.weight), m.weight, m.weight),
+            breakable(m.label_beside(final)),
+            bar(odds(m.weight).replace(" ", "\u00a0"), m.weight, m.weight),
             cell(f"{m.score - best:.1f}", m.score - best),
             _percent(m.left),
             _percent(m.unseen_percent),
@@ -46,6 +60,12 @@ def _weights(story: Discovery) -> Markup:
         "divided by the sum over all models. Held-out recordings do not enter the score. A "
         "difference of ten in score is decisive."
     )
+    if len(final) > 1:
+        said += f" “final” stands for {listed(final)}."
+    curves = [m.curve for m in story.considered[:SHOWN] if m.curve is not None]
+    if curves:
+        words = "; ".join(dict.fromkeys(f"{c.label} is the {c.spoken_coordinate}" for c in curves))
+        said += f" A curve is a free-form function of a coordinate: {words}."
     columns = ["model", "weight", "score above the best", "fitted, %", "held out, %", "fit"]
     more = len(story.considered) - SHOWN
     which = "all of them" if more <= 0 else f"the best {SHOWN} of {len(story.considered)}"
@@ -104,15 +124,14 @@ def _screened(diagnosis: Diagnosis, step: Step) -> Markup:
     told = diagnosis.table().head(len(top)).to_dict("records")
     rows = [
         [
-            r["effect"],
-            r["joint"],
+            join(breakable(r["effect"]), tag("small", "" if r["possible"] else " unphysical")),
+            r["joint"] if isinstance(r["joint"], int) else cell(r["joint"], 0.0),
             bar(f"{share:.3g}", share, share / 100),
             r["evidence"],
             cell(probability(r["p_value"]), r["p_value"]),
             _unbroken(r["amplitude"]),
             r["predicted_error_percent"],
             float(f"{abs(diagnosis.correlation(leader, v)):.2f}") if leader else None,
-            "" if r["possible"] else "unphysical",
         ]
         for v, r in zip(top, told, strict=True)
         for share in (r["explained_percent"],)
@@ -126,14 +145,16 @@ def _screened(diagnosis: Diagnosis, step: Step) -> Markup:
         "predicted amplitude",
         "predicted error, %",
         "likeness",
-        "note",
     ]
     said = (
-        "Every effect of the catalogue at its best setting, predicted from one fit. p-values are "
+        f"The first {len(top)} of {len(diagnosis.ranking)} entries of the catalogue, each at its "
+        "best setting, predicted from one fit. p-values are "
         f"corrected for {diagnosis.tests:.0f} independent tests; an effect counts as missing below "
         f"{diagnosis.significance:g}. Evidence is the whitened squared error that an effect "
         "explains, minus log(samples) for each amplitude. Likeness is the correlation of its "
-        "torque with that of the first effect of the list."
+        "torque with that of the first effect of the list. An unphysical effect would need "
+        "values that its law forbids, such as negative friction. “setting” is the multiple of the "
+        "change by which an effect without an amplitude was simulated."
     )
     title = "What each effect would explain beyond " + (
         "the starting model" if step.added is None else f"the model with {step_name(step)}"
@@ -143,7 +164,8 @@ def _screened(diagnosis: Diagnosis, step: Step) -> Markup:
 
 def _unbroken(amplitudes: str) -> str:
     """Amplitudes; lines may break between them but not within one."""
-    return ", ".join(one.replace(" ", "\u00a0") for one in amplitudes.split(", "))
+    signed = amplitudes.replace("-", "−")
+    return ", ".join(one.replace(" ", "\u00a0") for one in signed.split(", "))
 
 
 def where_table(diagnosis: Diagnosis) -> Markup:

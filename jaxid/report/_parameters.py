@@ -26,7 +26,7 @@ def parameters(story: Discovery) -> Markup:
         if several:
             shown += [_shown(before.get(name), "added"), _shown(after.get(name), "removed")]
             shift = shifts.get(name)
-            shown.append("" if shift is None else _shift(shift, most))
+            shown.append(cell("", math.nan) if shift is None else _shift(shift, most))
         else:
             shown.append(_shown(after.get(name), ""))
         rows.append([*shown, _interval(after.get(name))])

@@ -7,7 +7,7 @@ from ._again import settings
 from ._beside import Beside
 from ._effects import effects
 from ._errors import errors, rest
-from ._head import head
+from ._head import head, notes
 from ._html import Markup, anchor, join, link, tag
 from ._models import models
 from ._next import ahead
@@ -20,6 +20,7 @@ def body(story: Discovery) -> Markup:
     beside = Beside.of(story)
     first = signals(beside)
     after = [
+        notes(story),
         effects(story),
         errors(beside),
         models(story),

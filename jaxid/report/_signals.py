@@ -45,7 +45,7 @@ def _cards(beside: Beside) -> Markup:
         small = tag("small", f"noise alone\u00a0{percent(floor[j])}\u00a0%")
         rows.append(join(tag("span", f"joint {j + 1}"), tag("b", change), small))
     if len(rows) == 1:
-        return tag("div", tag("div", rows[0], class_="card"), class_="cards")
+        return tag("div", tag("div", rows[0], class_="card alone"), class_="cards")
     return choose("joint", "Joint that is shown", rows, beside.lead)
 
 

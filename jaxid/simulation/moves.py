@@ -36,6 +36,12 @@ def _split(p, x):
     return np.split(x, np.cumsum(p["sizes"])[:-1], axis=p["axis"])
 
 
+def _unstack(p, x):
+    moved = np.moveaxis(x, p["axis"], 0)
+    # The items of a vector of objects are the objects themselves, not arrays.
+    return [moved[k : k + 1].reshape(moved.shape[1:]) for k in range(len(moved))]
+
+
 MOVES: dict[str, Callable[..., Any]] = {
     "broadcast_in_dim": _broadcast,
     "reshape": _reshape,
@@ -47,5 +53,5 @@ MOVES: dict[str, Callable[..., Any]] = {
     "split": _split,
     "concatenate": lambda p, *xs: np.concatenate(xs, axis=p["dimension"]),
     "stack": lambda p, *xs: np.stack(xs, axis=p["axis"]),
-    "unstack": lambda p, x: list(np.moveaxis(x, p["axis"], 0)),
+    "unstack": _unstack,
 }

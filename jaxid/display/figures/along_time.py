@@ -11,10 +11,11 @@ from jaxtyping import Float
 from .look import (
     BLUE,
     DASHES,
+    GREEN,
     MISFIT,
+    NOISE,
     ORANGE,
     PALETTE,
-    SHADE,
     finish,
     with_unit,
 )
@@ -158,9 +159,12 @@ def before_after(
             x, y = decimated(*broken_at_gaps(time, measured - signal), most)
             style |= {"name": label, "legendgroup": label, "showlegend": False}
             figure.add_scatter(x=x, y=y, row=2, col=1, **style)
-    edges: dict[str, Any] = {"line": {"width": 0}, "layer": "below", "row": 2, "col": 1}
-    figure.add_hrect(y0=-band, y1=band, fillcolor=SHADE, **edges)
-    square = {"symbol": "square", "size": 12, "color": SHADE}
+    # Stretches without data are grey, too; the band of the noise has edges.
+    dotted = {"color": GREEN, "width": 1, "dash": "dot"}
+    edges: dict[str, Any] = {"line": dotted, "layer": "below", "row": 2, "col": 1}
+    figure.add_hrect(y0=-band, y1=band, fillcolor=NOISE, **edges)
+    square = {"symbol": "square", "size": 12, "color": NOISE}
+    square["line"] = {"color": GREEN, "width": 1}
     figure.add_scatter(x=[None], y=[None], name="noise", mode="markers", marker=square)
     shade_gaps(figure, time, [Trace(name, measured, unit)], "not compared")
     figure.update_yaxes(title_text=with_unit(name, unit), row=1, col=1)

@@ -10,6 +10,7 @@ INK = "#7b818b"
 GRID = "rgba(128,134,145,0.22)"
 SHADE = "rgba(128,134,145,0.20)"
 MISFIT = "rgba(216,69,90,0.20)"
+NOISE = "rgba(33,155,115,0.22)"
 BLUE, ORANGE, GREEN, PURPLE, RED = "#2f86dd", "#dd7320", "#219b73", "#9a66d8", "#d8455a"
 PALETTE = (BLUE, ORANGE, GREEN, PURPLE, RED, "#96891c", "#c458a6", INK)
 DASHES = ("solid", "dash", "dot", "dashdot", "longdash")

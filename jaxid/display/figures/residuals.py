@@ -50,7 +50,7 @@ def curve_fit(
 
     Arguments:
         x: Coordinate in `x_unit`, shape `(samples,)`.
-        y: Residual in `y_unit`, shape `(samples,)`; at most 2000 samples are drawn.
+        y: Residual in `y_unit`, shape `(samples,)`; of many samples, 2000 are drawn.
         x_name: Name of the coordinate, such as "velocity of joint 2".
         x_unit: Unit, as printed.
         y_unit: Unit, as printed.
@@ -63,17 +63,20 @@ def curve_fit(
     """
     figure = go.Figure()
     # Every k-th sample would alias with a periodic motion; a random sample does not.
-    few = np.sort(np.random.default_rng(0).permutation(len(x))[:MAX_DOTS])
+    most = len(x) if len(x) < 1.25 * MAX_DOTS else MAX_DOTS
+    few = np.sort(np.random.default_rng(0).permutation(len(x))[:most])
     name = y_name if len(few) == len(x) else f"{y_name} ({len(few)} of {len(x)} samples)"
     dots = {"color": INK, "size": 3.5, "opacity": 0.6}
     if len(x):
         figure.add_scatter(x=small(x[few]), y=small(y[few]), name=name, mode="markers", marker=dots)
     if band is not None:
-        figure.add_trace(band_trace("confidence band", curve_x, curve - band, curve + band))
+        figure.add_trace(band_trace("95 % band", curve_x, curve - band, curve + band))
     line = {"color": BLUE, "width": 2.6}
     figure.add_scatter(x=curve_x, y=curve, name=curve_name, mode="lines", line=line)
     figure.update_xaxes(title_text=with_unit(x_name, x_unit))
     figure.update_yaxes(title_text=with_unit(y_name, y_unit))
+    # The dots are too small for a legend.
+    figure.update_layout(legend={"itemsizing": "constant"})
     return finish(figure, title, height=400, legend=True)
 
 
