@@ -155,7 +155,7 @@ def _raised(search: Search, steps: Sequence[Step]) -> str:
         return ""
     pairs = itertools.pairwise(seen)
     culprits = [label for (_, one), (label, other) in pairs if risen(one, other, noise)]
-    # All effects together say nothing that the reason does not say.
+    # The names of all added effects would not add to the reason.
     some = 0 < len(culprits) < len(seen) - 1
     said = f"; it rose with {' and '.join(x.removeprefix('+ ') for x in culprits)}"
     return reason + said * some
