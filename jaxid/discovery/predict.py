@@ -203,7 +203,9 @@ class Predictor(eqx.Module):
         first, *others = differences(
             system.loop, system.batch, [effect, *moved], system.row, nominal
         )
-        columns = [first, *((x - first) / d for x, d in zip(others, by, strict=True))]
+        # A run that diverges has infinite slopes, and its effect is not predicted.
+        with np.errstate(over="ignore"):
+            columns = [first, *((x - first) / d for x, d in zip(others, by, strict=True))]
         return at_samples(system.batch, np.stack(columns, axis=-1))
 
     def _ended(self, found: "_Reached") -> Prediction:

@@ -164,5 +164,6 @@ def _gains(
     near = still + 1e-9 + (law.deadband if isinstance(law, Servo) else 0.0)
     by_error, by_speed = jax.jacfwd(torque, argnums=(0, 1))(near, still)
     most = np.asarray(torque(still + _FAR, still))
-    kp, kd = np.diagonal(np.asarray(by_error)), -np.diagonal(np.asarray(by_speed))
+    # Zero minus zero, because minus zero would be printed as -0.
+    kp, kd = np.diagonal(np.asarray(by_error)), 0.0 - np.diagonal(np.asarray(by_speed))
     return kp, kd, np.where(most > 0.5 * _FAR * np.maximum(kp, 1e-30), np.inf, most)
