@@ -30,6 +30,17 @@ class SaveError(JaxidError, ValueError):
     """A saved result, or a piece of a campaign, cannot be written or read."""
 
 
+class MissingClassError(SaveError):
+    """A saved result has an object of a class of the user's that was not given.
+
+    `name` is the name of the class.
+    """
+
+    def __init__(self, message: str, name: str = ""):
+        super().__init__(message)
+        self.name = name
+
+
 class NoiseError(FitError):
     """The residuals do not allow the requested noise filter.
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import numpy as np
 
 from ..errors import ModelError, RecordingError, near
 
@@ -54,7 +53,7 @@ class ReadOptions(eqx.Module):
         """
         recordings = self(files)
         for one, other in itertools.combinations(recordings, 2):
-            if np.array_equal(one.q, other.q) and np.array_equal(one.tau, other.tau):
+            if one.same_samples(other):
                 raise RecordingError(
                     f"{one.name} and {other.name} have the same samples: name each recording "
                     "once, since a copy makes deviations too small"

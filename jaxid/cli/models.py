@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import ModelError, SaveError
+from ..errors import MissingClassError, ModelError
 
 
 def load_robot(robot: str | None) -> Any:
@@ -159,15 +159,12 @@ def saved_model(robot: str | None, path: Path | None, own: frozenset[type] = fro
         theirs = frozenset() if robot is None else classes_of(load_robot(robot))
         try:
             saved = load(path, theirs | own)
-        except SaveError as error:
-            if robot is None and "of your class" in str(error):
-                # The remedy is for Python.
-                what = str(error).partition("; pass it")[0]
-                raise ModelError(
-                    f"{what}: name its file, --robot FILE.py:NAME, or --catalogue FILE.py:NAME "
-                    "for an effect"
-                ) from error
-            raise
+        except MissingClassError as error:
+            # The remedy of the message is for Python.
+            raise ModelError(
+                f"{path} has an object of your class {error.name}: name its file, --robot "
+                "FILE.py:NAME, or --catalogue FILE.py:NAME for an effect"
+            ) from error
         if not hasattr(saved, "loop"):
             raise ModelError(f"{path} contains no model: give a saved fit or story")
         return saved.loop

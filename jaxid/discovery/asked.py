@@ -4,7 +4,6 @@ from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
-import numpy as np
 
 from ..errors import RecordingError
 from ..estimate import OEM
@@ -52,7 +51,7 @@ def check_apart(recordings: Recordings, held_out: Iterable[Recording]) -> None:
     """Raises `RecordingError` if a held-out recording was also fitted, under any name."""
     for unseen in held_out:
         for fitted in recordings:
-            if np.array_equal(unseen.q, fitted.q) and np.array_equal(unseen.tau, fitted.tau):
+            if unseen.same_samples(fitted):
                 raise RecordingError(
                     f"{unseen.name} is held out and has the samples of {fitted.name}, which is "
                     "fitted: a model must be tested on recordings to which it was not fitted"

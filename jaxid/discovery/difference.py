@@ -206,7 +206,7 @@ def _shared(first: Model, second: Model) -> tuple[Fit, Fit] | None:
         return None
     pairs = list(zip(first.recordings, second.recordings, strict=False))
     alike = len(first.recordings) == len(second.recordings) and all(
-        np.array_equal(a.q, b.q) and np.array_equal(a.tau, b.tau) for a, b in pairs
+        a.same_samples(b) for a, b in pairs
     )
     same = alike and _sizes(first.residuals) == _sizes(second.residuals)
     return (first, second) if same else None

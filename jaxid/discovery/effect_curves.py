@@ -21,7 +21,7 @@ from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from .comparison import Comparison, compare
 from .hypotheses import effect_on
-from .signatures import Placed, force_and_slopes, left_for_links
+from .signatures import Placed, force_and_slopes, left_for_links, misreads
 from .text import WIDTH
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class EffectCurve(AbstractShown):
     @property
     def sensed(self) -> bool:
         """Whether the effect changes a sensor's reading, and the curve is that change."""
-        return _sensed(self.effect)
+        return misreads(self.effect)
 
     @property
     def name(self) -> str:
@@ -264,14 +264,10 @@ def _own(loop: ClosedLoop, place: int, motion: Motion) -> tuple[np.ndarray, np.n
     left = left_for_links(_without(loop, place), motion)
     fields = tuple(str(p.place[-1]) for p in _parameters(loop, place))
     push, noise, _ = force_and_slopes(Placed.of(effect, loop.joints), motion, left, fields)
-    sensed = _sensed(effect)
+    sensed = misreads(effect)
     # The sign changes, because torque that the effect adds to the joint relieves the drive.
     found = np.asarray(noise) if sensed else -np.asarray(push)
     return found[..., 0], found[..., 1:], sensed
-
-
-def _sensed(effect: AbstractEffect) -> bool:
-    return type(effect).read is not AbstractEffect.read
 
 
 def _without(loop: ClosedLoop, place: int) -> ClosedLoop:
@@ -298,7 +294,7 @@ def _coordinate(
     """The coordinate that explains most of a torque, and the share that it explains."""
     joints = [joint, *(j for j in range(1, motion.q.shape[-1] + 1) if j != joint)]
     # A sensor's error depends on the position that it reads.
-    order = ("q", "v", "tau", "a") if _sensed(effect) else ("v", "q", "tau", "a")
+    order = ("q", "v", "tau", "a") if misreads(effect) else ("v", "q", "tau", "a")
     names = [(c, j) for j in joints for c in order]
     found = [
         Curve(joint=joint, coordinate=c, of=j, signed=signed)  # type: ignore[arg-type]

@@ -248,7 +248,7 @@ def _all_forces(
             forces = eqx.filter_vmap(own, in_axes=eqx.if_array(0))(stacked)
             push, noise, rate = (_by_point(x.astype(jnp.float32)) for x in forces)
             pushes.append(push)
-            if _misreads(stacked.effect):
+            if misreads(stacked.effect):
                 noises.append(noise)
                 rates.append(rate)
         none = [jnp.zeros((*left.shape, 0), jnp.float32)]
@@ -266,7 +266,7 @@ def _by_point(x: Float[Array, "settings points joints columns"]) -> Float[Array,
     return jnp.moveaxis(x, 0, 2).reshape(*x.shape[1:3], -1)
 
 
-def _misreads(effect: AbstractEffect) -> bool:
+def misreads(effect: AbstractEffect) -> bool:
     """Whether the effect acts on a sensor's reading."""
     return type(effect).read is not AbstractEffect.read
 
@@ -290,7 +290,7 @@ def _responses(
 
     The forces of all runs together would be several times as large as the table.
     """
-    reading = _columns(hypotheses, _misreads)
+    reading = _columns(hypotheses, misreads)
     behind = _columns(hypotheses, lambda e: e.on_link) if "pull" in linear.places else []
     left = left_for_links(loop, linear.motion)
 

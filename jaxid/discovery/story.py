@@ -29,7 +29,7 @@ from .hypotheses import effect_on
 from .landscape import form
 from .models import Model, models_table, named, picked
 from .step import Step, added_in_words, errors_of, found_parameters, joint_errors, odds, step_name
-from .text import WIDTH, errors_table, joined, models_lines, wrapped
+from .text import WIDTH, capitalised, errors_table, joined, models_lines, wrapped
 from .verdict import Outcome
 from .verify import Refits
 
@@ -128,13 +128,13 @@ class Discovery(AbstractShown):
             return f"The model lacked {added}; with that, nothing is left to explain."
         lacked = f"The model lacked {added}; " if added else ""
         if not self.diagnosis.depends_on():
-            return _upper(f"{lacked}no effect of the catalogue explains what is left.")
+            return capitalised(f"{lacked}no effect of the catalogue explains what is left.")
         hypothesis = self.diagnosis.where[0].hypothesis
         curve = hypothesis.effect
         assert isinstance(curve, Curve)
         on = "time" if curve.coordinate == "t" else f"the {curve.spoken_coordinate}"
         how = " and on the direction of motion" if curve.signed else ""
-        return _upper(
+        return capitalised(
             f"{lacked}no effect of the catalogue explains how the residual torque of joint "
             f"{hypothesis.joint} depends on {on}{how}."
         )
@@ -395,7 +395,3 @@ class Discovery(AbstractShown):
             f"{errors.to_html(float_format='%.3f')}<p>noise floor by joint: {floor}</p>"
             f"<ul>{lines}</ul><p>models, best first</p>{models}"
         )
-
-
-def _upper(sentence: str) -> str:
-    return sentence[:1].upper() + sentence[1:]

@@ -18,6 +18,11 @@ def joined(words: Sequence[str]) -> str:
     return " and ".join(x for x in (", ".join(words[:-1]), *words[-1:]) if x)
 
 
+def capitalised(words: str) -> str:
+    """The words with a capital first letter; the others are unchanged."""
+    return f"{words[:1].upper()}{words[1:]}"
+
+
 def wrapped(text: str) -> list[str]:
     """A paragraph in lines; all lines except the first are indented."""
     return textwrap.wrap(text, WIDTH, subsequent_indent="  ", break_on_hyphens=False)

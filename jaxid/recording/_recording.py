@@ -217,6 +217,10 @@ class Recording(eqx.Module):
         cut = {signal: values[start:stop] for signal, values in _signals(self).items()}
         return Recording(**cut, resolution=self.resolution, name=self.name)
 
+    def same_samples(self, other: "Recording") -> bool:
+        """Whether another recording, of any name, has the same positions and torque."""
+        return np.array_equal(self.q, other.q) and np.array_equal(self.tau, other.tau)
+
     def to_dataframe(self) -> "pd.DataFrame":
         """A table with one row for each sample; `from_table` restores the recording from it."""
         import pandas as pd

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..discovery import Discovery
+from ..discovery.text import capitalised
 from ..effects import AbstractEffect
 from ..errors import JaxidError
 from ._head import effects_title, values_below
@@ -33,11 +34,7 @@ def _curve(story: Discovery, effect: AbstractEffect) -> Content:
     cloud = "" if curve.cloud is None else ", over the residual of the model without the effect"
     shown = "its change of the position reading" if curve.sensed else "its torque"
     caption = (
-        f"{_upper(curve.name)}: {shown}{times} against the {curve.coordinate}{band}{cloud}."
+        f"{capitalised(curve.name)}: {shown}{times} against the {curve.coordinate}{band}{cloud}."
         f"{part * (curve.share < 0.98)}{unsure}"
     )
     return figure(curve.plot(), caption)
-
-
-def _upper(words: str) -> str:
-    return words[:1].upper() + words[1:]

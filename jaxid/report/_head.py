@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from ..discovery import Discovery
 from ..discovery.hypotheses import effect_on
 from ..discovery.step import Step, odds
+from ..discovery.text import capitalised
 from ._html import Markup, anchor, join, link, section, tag, with_deviation
 
 # Characters above which the headline is smaller.
@@ -48,8 +49,8 @@ def _reason(story: Discovery) -> Markup | None:
 def _sentence(words: str) -> str:
     # A name in a program begins with a small letter.
     first = words.split(" ")[0]
-    upper = words[:1].upper() if first.isalpha() else words[:1]
-    return f"{upper}{words[1:].rstrip('.')}.".replace("\u00a0%", " %").replace(" %", "\u00a0%")
+    said = capitalised(words) if first.isalpha() else words
+    return f"{said.rstrip('.')}.".replace("\u00a0%", " %").replace(" %", "\u00a0%")
 
 
 def _asked(story: Discovery) -> Markup:
@@ -94,7 +95,7 @@ def values(story: Discovery) -> Markup | None:
     for step, entry in zip(steps, story.to_dict()["added"], strict=True):
         shown = "; ".join(_value(name, **p) for name, p in entry["parameters"].items())
         name = _name(step)
-        title = tag("b", f"{name[:1].upper()}{name[1:]}")
+        title = tag("b", capitalised(name))
         sure = f"probability\u00a0{odds(step.probability)}".replace(" ", "\u00a0")
         lines.append(tag("li", join(title, f" ({sure}): {shown}")))
     return tag("ul", *lines, class_="found") if lines else None

@@ -7,6 +7,7 @@ from ..discovery.diagnosis import Diagnosis, Verdict
 from ..discovery.hypotheses import effect_on
 from ..discovery.models import listed
 from ..discovery.step import Step, odds, step_name
+from ..discovery.text import capitalised
 from ._html import (
     Content,
     Markup,
@@ -90,7 +91,7 @@ def _reason(diagnosis: Diagnosis | None, step: Step) -> str:
         return "It was chosen by the score of its refit."
     rival = others[0]
     said = (
-        f"{_upper(effect_on(chosen.hypothesis.effect.spoken(), key[1]))} explains "
+        f"{capitalised(effect_on(chosen.hypothesis.effect.spoken(), key[1]))} explains "
         f"{_share(diagnosis, chosen)} of the whitened residual of the previous model; noise is "
         f"{100 * diagnosis.gram.count / diagnosis.gram.rest:.3g} % of it. The best other effect, "
         f"{effect_on(rival.hypothesis.effect.spoken(), rival.hypothesis.joint)}, explains "
@@ -100,10 +101,6 @@ def _reason(diagnosis: Diagnosis | None, step: Step) -> str:
     if chosen.evidence > rival.evidence:
         return said
     return f"{said} The other effect was ahead before both were fitted, and behind afterwards."
-
-
-def _upper(words: str) -> str:
-    return words[:1].upper() + words[1:]
 
 
 def _share(diagnosis: Diagnosis, verdict: Verdict) -> str:

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..errors import SaveError, sentence
+from ..errors import MissingClassError, SaveError, sentence
 from .arrays import npy
 from .classes import Registry, agrees, hints, origin, rebuilt
 
@@ -279,11 +279,12 @@ class _Unpacker:
             same = [c for (p, n), c in self.registry.items() if p and n == name]
             found = same[0] if len(same) == 1 else None
         if found is None and package not in ("", "diffrax"):
-            raise _complaint(
+            said = sentence(
                 self.source,
                 f"has an object of your class {name} (of {package})",
                 f"pass it: jaxid.load(path, classes=[{name}])",
             )
+            raise MissingClassError(said, name)
         if found is None:
             raise _complaint(
                 self.source,
