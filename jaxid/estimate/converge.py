@@ -194,10 +194,13 @@ _FLOOR = 1e-10
 
 
 def finer_substeps(done: Converged) -> int | None:
-    """A finer number of substeps, if halving the step moves the torque by more than 1e-4."""
+    """A finer number of substeps, if halving the step moves the torque by more than 1e-4.
+
+    None for a model that explains nothing: its values are meaningless, and may need any number.
+    """
     if not done.minimum.status.simulated or done.loop.stepping.control is not None:
         return None
-    if isinstance(done.loop.controller, OpenLoop):
+    if isinstance(done.loop.controller, OpenLoop) or _explains_nothing(done):
         return None
     now, batch = done.loop.stepping.substeps or 1, done.batch
     if _at_its_sharpest(done):
@@ -218,6 +221,23 @@ def finer_substeps(done: Converged) -> int | None:
     # A method of order p leaves 2⁻ᵖ of its error at half the step.
     power = 1.2 / (done.loop.stepping.solver.order(None) or 1)
     return refined(now * (error.max() / 1e-4) ** power + 1, done.loop.name)
+
+
+def residual_series(done: Converged) -> list[np.ndarray]:
+    """Measured minus simulated, `(samples, outputs)` for each recording, in their own units."""
+    raw = np.asarray(done.minimum.point.found.raw) / np.asarray(done.weights)
+    mask = np.asarray(done.batch.kept)
+    return [row[there] for row, there in zip(raw, mask, strict=True)]
+
+
+def _explains_nothing(done: Converged) -> bool:
+    """Whether every residual is larger than its signal."""
+    batch = done.batch
+    measured = {"tau": batch.tau, "q": batch.q}
+    signals = [np.asarray(batch.compared(measured[name])) for name in done.signals]
+    signal = np.concatenate(signals, axis=-1)[np.asarray(batch.kept)]
+    rest = np.concatenate(residual_series(done))
+    return bool(np.all(np.linalg.norm(rest, axis=0) > np.linalg.norm(signal, axis=0)))
 
 
 def _at_its_sharpest(done: Converged) -> bool:

@@ -24,7 +24,7 @@ from ..noise import (
 from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
 from ..simulation.steps import with_substeps
-from .converge import Converged, converge
+from .converge import Converged, converge, residual_series
 from .covariance import Deviations
 from .oem import OEM
 from .pieces import compared_signals
@@ -146,13 +146,6 @@ def keeping(done: Converged, method: OEM, recordings: Recordings) -> Iterator[No
     except NoiseError as error:
         error.fit = report(method.deviations, done, recordings, 0.0, method)
         raise
-
-
-def residual_series(done: Converged) -> list[np.ndarray]:
-    """Measured minus simulated, `(samples, outputs)` for each recording, in their own units."""
-    raw = np.asarray(done.minimum.point.found.raw) / np.asarray(done.weights)
-    mask = np.asarray(done.batch.kept)
-    return [row[there] for row, there in zip(raw, mask, strict=True)]
 
 
 def noise_filters(
