@@ -25,6 +25,7 @@ from .remarks import remarks
 from .search import Search
 from .step import Step
 from .story import Discovery
+from .text import joined
 from .verdict import Outcome, misfit_of, refuted, risen, undecided
 
 _STOPPED = "the search was interrupted; resume=... continues it from its saved steps"
@@ -157,7 +158,7 @@ def _raised(search: Search, steps: Sequence[Step]) -> str:
     culprits = [label for (_, one), (label, other) in pairs if risen(one, other, noise)]
     # The names of all added effects would not add to the reason.
     some = 0 < len(culprits) < len(seen) - 1
-    said = f"; it rose with {' and '.join(x.removeprefix('+ ') for x in culprits)}"
+    said = f"; it rose with {joined([x.removeprefix('+ ') for x in culprits])}"
     return reason + said * some
 
 
