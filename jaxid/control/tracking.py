@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -32,17 +33,22 @@ class Tracking(AbstractController):
       is computed at every sample and held in between.
     - `cutoff`: cutoff of the low-pass, Hz. By default the frequency above which the recorded motion
       is noise; a fit uses the lowest of its recordings.
-    - `still`: share of its highest speed below which a joint counts as standing still. Motion does
-      not determine static friction, which may be any torque up to the breakaway torque. The torque
-      of such samples, and of samples within a period of the cutoff (at least 30 ms) from them, is
-      therefore not compared. Zero compares all samples.
+    - `still`: share of its highest speed below which a joint counts as standing still, one for all
+      joints or one per joint. Motion does not determine static friction, which may be any torque up
+      to the breakaway torque. The torque of such samples is therefore not compared. Zero compares
+      all samples. By default it is a hundredth; a fit raises it if torque at low speed is no
+      function of motion.
+    - `reach`: time from such samples within which torque is not compared either, in periods of the
+      cutoff, or of 30 ms if they are shorter; one for all joints or one per joint. By default one;
+      a fit raises it to two if that of the low-pass is longer than the noise hides.
     """
 
     bandwidth: float = 40.0
     damping: float = 1.0
     cutoff: float | None = eqx.field(static=True, default=None)
     delay: float = eqx.field(static=True, default=0.0)
-    still: float = eqx.field(static=True, default=0.01)
+    still: float | Float[Any, " joints"] | None = None
+    reach: float | Float[Any, " joints"] | None = None
 
     @property
     def pace(self) -> float:
@@ -77,21 +83,29 @@ class Tracking(AbstractController):
 
         If a joint reverses so often that few samples remain, samples nearer to a reversal are used.
         """
-        if self.still <= 0:
+        still = STILL if self.still is None else np.asarray(self.still)
+        if np.all(still <= 0):
             return None
         time = even_times(recording)
         speed = np.gradient(smooth_motion(recording, cutoff), time, axis=0)
-        standing = np.abs(speed) < self.still * np.abs(speed).max(axis=0)
+        standing = np.abs(speed) < still * np.abs(speed).max(axis=0)
         # A fast reversal may be between two samples.
         turns = speed[1:] * speed[:-1] < 0
         standing[1:] |= turns
         standing[:-1] |= turns
         memory = recording.rate * max(1 / cutoff, _PRESLIDING)
-        return np.stack([_far_from(column, memory) for column in standing.T], axis=1)
+        reach = np.zeros(len(standing.T)) + np.asarray(REACH if self.reach is None else self.reach)
+        pairs = zip(standing.T, memory * reach, strict=True)
+        return np.stack([_far_from(column, span) for column, span in pairs], axis=1)
 
     def settled(self, recordings: Iterable[Recording]) -> "Tracking":
-        """The controller with one cutoff for all recordings: the lowest of their cutoffs."""
-        return dataclasses.replace(self, cutoff=min(map(self.comparable, recordings)))
+        """The controller with the lowest cutoff of all recordings, and settings of each joint."""
+        recordings = list(recordings)
+        each = np.zeros(recordings[0].q.shape[1])
+        still = each + np.asarray(STILL if self.still is None else self.still)
+        reach = each + np.asarray(REACH if self.reach is None else self.reach)
+        cutoff = min(map(self.comparable, recordings))
+        return dataclasses.replace(self, cutoff=cutoff, still=still, reach=reach)
 
     def signals(self, recording: Recording) -> Signals:
         """The low-passed recorded motion, `(samples, joints)`."""
@@ -103,6 +117,11 @@ class Tracking(AbstractController):
         return Signals(q, np.zeros_like(recording.tau))
 
 
+# Share of its highest speed below which a joint stands still.
+STILL = 0.01
+# Reach of standstill in periods of the cutoff. After one period the low-pass leaves about a
+# hundredth of a jump of friction, after two periods a thousandth.
+REACH = 1.0
 # Time in which dry friction builds up after a reversal, s, for any cutoff.
 _PRESLIDING = 0.03
 # Smallest share of a joint's moving samples that is compared.

@@ -6,12 +6,13 @@ import numpy as np
 
 from ..effects import ActuatorLag, TimeDelay
 from ..estimate import Fit
+from ..estimate.standstill import slow_note
 from ..simulation.loop import ClosedLoop
 from .step import Step
 
 
 def remarks(steps: Sequence[Step], given: ClosedLoop) -> tuple[str, ...]:
-    """Notes on fits that did not converge, released values, and an undeclared sampled law.
+    """Notes on failed fits, released values, slow motion and an undeclared sampled law.
 
     **Arguments:**
 
@@ -20,7 +21,8 @@ def remarks(steps: Sequence[Step], given: ClosedLoop) -> tuple[str, ...]:
     bad = [s.label for s in steps if not s.fit.succeeded]
     said = [f"the fit of {', '.join(bad)} did not converge: use its values with care"]
     last = steps[-1].fit
-    return (*(said if bad else ()), *_estimated(last, given), *looks_sampled(last))
+    more = (*_estimated(last, given), *slow_note(last.loop), *looks_sampled(last))
+    return (*(said if bad else ()), *more)
 
 
 def _estimated(fit: Fit, given: ClosedLoop) -> list[str]:

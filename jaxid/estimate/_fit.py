@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..arms import SerialArm, physical_bodies
-from ..control import Reading, Sampled
+from ..control import Reading, Sampled, Tracking
 from ..effects import AbstractEffect, AbstractTransmission, check_declared
 from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
@@ -19,6 +19,7 @@ from ..simulation.batch import at_rest, check_joints, check_law
 from ..simulation.loop import ClosedLoop
 from .oem import OEM
 from .result import DOUBTFUL_PERCENT, AbstractMethod, Fit, Status
+from .standstill import raised, slow_note
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,7 +43,8 @@ def fit(
     recordings = Recordings.of(recordings)
     check_joints(loop, recordings[0])
     check_law(loop)
-    loop = dataclasses.replace(loop, controller=loop.controller.settled(recordings))
+    law = loop.controller
+    loop = dataclasses.replace(loop, controller=law.settled(recordings))
     for effect in loop.effects:
         check_declared(effect, loop.joints)
     method = OEM() if method is None else method
@@ -54,8 +56,14 @@ def fit(
         )
     if method.rigid:
         _check_rigid(loop, method)
-    found = _followed(_doubted(_without_nan(method.fit(loop, recordings))))
-    notes = (*found.notes, *_matter(found), *_band(loop, recordings), *_gaps(recordings))
+    found = method.fit(loop, recordings)
+    chosen = isinstance(law, Tracking) and law.still is None and law.reach is None
+    while chosen and found.succeeded and (faster := raised(found)) is not None:
+        loop = dataclasses.replace(loop, controller=faster)
+        found = method.fit(loop, recordings)
+    found = _followed(_doubted(_without_nan(found)))
+    notes = (*found.notes, *_matter(found), *_band(loop, recordings), *slow_note(loop))
+    notes = (*notes, *_gaps(recordings))
     notes = (*notes, *_restarted(loop, recordings))
     return dataclasses.replace(found, notes=notes)
 
