@@ -214,3 +214,22 @@ def test_an_effect_that_a_curve_replaces_is_not_part_of_the_answer():
     assert search._verdict([], 0.0) == ("outside_catalogue", False)
     assert asked == [[spring]]
     assert search.at.effects[0] is spring
+
+
+def test_sets_with_unsupported_effects_do_not_hide_a_supported_one():
+    """A pair whose second effect fits one stretch is skipped, and the best other set is fitted."""
+    search = object.__new__(Search)
+    search._supported = lambda c: "fits one stretch" not in c.key
+    scores = {
+        ("stribeck", "fits one stretch"): -300.0,
+        ("drag", "fits one stretch"): -290.0,
+        ("stribeck",): -200.0,
+        ("drag", "stribeck"): -199.0,
+        ("ripple",): -190.0,
+        ("spring",): -150.0,
+    }
+    sets: list = [SimpleNamespace(key=key, score=value) for key, value in scores.items()]
+    found = search._to_fit(sets, nothing=0.0)
+    # A superset of a better one is left out, and so is what is far behind.
+    assert [c.key for c in found] == [("stribeck",), ("ripple",)]
+    assert search._to_fit(sets[:2], nothing=0.0) == []

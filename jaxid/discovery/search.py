@@ -33,6 +33,8 @@ from .watched import ROUND, Watched
 # Largest number of sets that are refitted in one round, and the relative error of predicted
 # decreases of the score.
 _VERIFIED, _INEXACT = 3, 0.08
+# Largest number of predicted sets among which those are searched.
+_EXAMINED = 12
 # Largest number of effects in a predicted set. What sets of two explain is predicted to a few per
 # cent; larger sets are searched from the next fit.
 _AHEAD = 2
@@ -181,14 +183,8 @@ class Search:
     def _verified(self, at: Model, candidates: Sequence[Candidate], nothing: float) -> Model | None:
         """The best refit of the best predicted sets; None if none is better than the model."""
         plain = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
-        tried: list[Candidate] = []
-        if plain and len(at.effects) < self.asked.most:
-            reach = max(DECISIVE, _INEXACT * (nothing - plain[0].score))
-            near = [c for c in plain if c.score < plain[0].score + reach]
-            # A set that contains a better one is left out: the smaller one is fitted first.
-            keys = [Counter(c.key) for c in near]
-            tried = [c for k, c in enumerate(near) if not any(x < keys[k] for x in keys[:k])]
-            tried = list(islice(filter(self._supported, tried), _VERIFIED))
+        full = len(at.effects) >= self.asked.most
+        tried = [] if full else self._to_fit(plain, nothing)
         # Effects that explain much less than one curve only approximate the curve.
         alone = [c.score for c in candidates if c.curve is not None and not c.effects]
         gain = nothing - min(alone, default=np.inf)
@@ -199,6 +195,28 @@ class Search:
         anchor = at.score - nothing if best is None else best[0].score - best[1].score
         self.visited.add_predicted(candidates, at, anchor, self._left_by)
         return None if best is None else best[0]
+
+    def _to_fit(self, plain: Sequence[Candidate], nothing: float) -> list[Candidate]:
+        """The best supported set, and those that may be better after a fit.
+
+        **Arguments:**
+
+        - `plain`: sets without a curve, best first. `nothing`: score of the empty set.
+        """
+        found: list[Candidate] = []
+        seen: list[Counter] = []
+        reach = np.inf
+        for c in islice(plain, _EXAMINED):
+            if len(found) == _VERIFIED or c.score > reach:
+                break
+            key = Counter(c.key)
+            # A set that contains a better one is left out: the smaller one is fitted first.
+            if not any(x < key for x in seen) and self._supported(c):
+                if not found:
+                    reach = c.score + max(DECISIVE, _INEXACT * (nothing - c.score))
+                found.append(c)
+            seen.append(key)
+        return found
 
     def _supported(self, c: Candidate) -> bool:
         """Whether each effect explains left-out stretches; a note names those that do not."""
