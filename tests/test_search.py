@@ -11,7 +11,7 @@ from independent import effects as fx
 from stories import recordings_of, search_of, with_chain
 
 import jaxid
-from jaxid.discovery.explore import _fitted, _plain, key_of
+from jaxid.discovery.explore import Candidate, _fitted, _plain, key_of
 from jaxid.discovery.hypotheses import Hypothesis
 from jaxid.discovery.landscape import Entry, shares_a_joint
 from jaxid.discovery.likelihood import price, score, weights
@@ -216,20 +216,26 @@ def test_an_effect_that_a_curve_replaces_is_not_part_of_the_answer():
     assert search.at.effects[0] is spring
 
 
+def candidate(score: float, *effects) -> Candidate:
+    found = object.__new__(Candidate)
+    for name, value in (("effects", effects), ("score", score), ("curve", None)):
+        object.__setattr__(found, name, value)
+    return found
+
+
 def test_sets_with_unsupported_effects_do_not_hide_a_supported_one():
     """A pair whose second effect fits one stretch is skipped, and the best other set is fitted."""
     search = object.__new__(Search)
-    search._supported = lambda c: "fits one stretch" not in c.key
-    scores = {
-        ("stribeck", "fits one stretch"): -300.0,
-        ("drag", "fits one stretch"): -290.0,
-        ("stribeck",): -200.0,
-        ("drag", "stribeck"): -199.0,
-        ("ripple",): -190.0,
-        ("spring",): -150.0,
-    }
-    sets: list = [SimpleNamespace(key=key, score=value) for key, value in scores.items()]
-    found = search._to_fit(sets, nothing=0.0)
+    search._supported = lambda c: not any(isinstance(e, RotorInertia) for e in c.effects)
+    stribeck, drag, unsupported = Stribeck(1, 0.2, 0.1), QuadraticDrag(1), RotorInertia(1)
+    sets = [
+        candidate(-300.0, stribeck, unsupported),
+        candidate(-290.0, drag, unsupported),
+        candidate(-200.0, stribeck),
+        candidate(-199.0, drag, stribeck),
+        candidate(-190.0, TorqueOffset(1)),
+        candidate(-150.0, Spring(1)),
+    ]
     # A superset of a better one is left out, and so is what is far behind.
-    assert [c.key for c in found] == [("stribeck",), ("ripple",)]
+    assert search._to_fit(sets, nothing=0.0) == [sets[2], sets[4]]
     assert search._to_fit(sets[:2], nothing=0.0) == []
