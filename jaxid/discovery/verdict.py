@@ -26,7 +26,7 @@ Outcome = Literal["adequate", "explained", "outside_catalogue", "undetermined"]
 _REFUTED = 1.10
 # The same ratio if the law is unknown, and the smallest relevant excess, in % of the torque.
 # Filters on both signals, the ticks of the law and stiction cause errors of this size.
-_BLURRED, _BLUR = 1.30, 1.0
+_BLURRED, _BLUR = 1.30, 0.2
 # Smallest significant excess, in standard deviations.
 _SURE = 4.0
 # Ratio of the residual's power to that of its innovations above which it is not white noise.
