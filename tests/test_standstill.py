@@ -74,6 +74,7 @@ def test_slow_samples_that_bend_the_model_are_left_out_and_a_note_says_so():
     assert found.table().loc["Fc1", "value"] == pytest.approx(DRY, rel=0.03)
     # The given share stays, and the fitted one is used on other recordings.
     np.testing.assert_allclose(before.loop.controller.still, 0.01)
+    assert not any("highest speed" in n for n in fitted(sticking, still=0.03).notes)
     unseen = jaxid.compare(found, recorded(9, sticking))
     assert unseen.error_percent.to_numpy().max() < 1.3 * found.error_percent.to_numpy().max()
 

@@ -40,7 +40,7 @@ class Tracking(AbstractController):
       function of motion.
     - `reach`: time from such samples within which torque is not compared either, in periods of the
       cutoff, or of 30 ms if they are shorter; one for all joints or one per joint. By default one;
-      a fit raises it to two if that of the low-pass is longer than the noise hides.
+      a fit raises it to two if the low-pass visibly spreads a jump of friction further.
     """
 
     bandwidth: float = 40.0

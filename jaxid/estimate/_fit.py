@@ -59,10 +59,12 @@ def fit(
     found = method.fit(loop, recordings)
     chosen = isinstance(law, Tracking) and law.still is None and law.reach is None
     while chosen and found.succeeded and (faster := raised(found)) is not None:
-        loop = dataclasses.replace(loop, controller=faster)
-        found = method.fit(loop, recordings)
+        again = method.fit(dataclasses.replace(loop, controller=faster), recordings)
+        if not again.succeeded:
+            break
+        found = again
     found = _followed(_doubted(_without_nan(found)))
-    notes = (*found.notes, *_matter(found), *_band(loop, recordings), *slow_note(loop))
+    notes = (*found.notes, *_matter(found), *_band(loop, recordings), *slow_note(law, found.loop))
     notes = (*notes, *_gaps(recordings))
     notes = (*notes, *_restarted(loop, recordings))
     return dataclasses.replace(found, notes=notes)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..control import Tracking
+from ..control import AbstractController, Tracking
 from ..control.tracking import STILL
 from ..recording import Recording
 from ..signals.smoothing import even_times, smooth_motion
@@ -63,10 +63,17 @@ def raised(found: Fit) -> Tracking | None:
     return None
 
 
-def slow_note(loop: ClosedLoop) -> list[str]:
-    """A note on joints whose torque is not compared at low speed because of a fit."""
+def slow_note(given: AbstractController, loop: ClosedLoop) -> list[str]:
+    """A note on joints whose torque is not compared at low speed because of a fit.
+
+    **Arguments:**
+
+    - `given`: the controller before the fit. `loop`: the fitted loop.
+    """
     law = loop.controller
     if not isinstance(law, Tracking) or law.still is None:
+        return []
+    if isinstance(given, Tracking) and given.still is not None:
         return []
     shares = np.zeros(loop.joints) + np.asarray(law.still)
     said = [f"{100 * x:.2g} % on joint {j + 1}" for j, x in enumerate(shares) if x > STILL]
