@@ -1,6 +1,7 @@
 """Result files of the worlds benchmark: a line of JSON for each case, with its origin."""
 
 import json
+import math
 import subprocess
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
@@ -34,11 +35,14 @@ def origin(seed: int) -> dict[str, Any]:
 
 
 def probabilities(models: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The probability of every effect that a model of a story has: the weight of those with it."""
+    """The probability of every effect of a story, among its models without a free-form curve."""
     total: dict[tuple[str, int | None], float] = {}
-    for model in models:
+    plain = [m for m in models if not m["curve"]]
+    best = min(m["difference"] for m in plain)
+    weights = [math.exp(-0.5 * (m["difference"] - best)) for m in plain]
+    for model, weight in zip(plain, weights, strict=True):
         for key in {(e["effect"], e["joint"]) for e in model["effects"]}:
-            total[key] = total.get(key, 0.0) + model["weight"]
+            total[key] = total.get(key, 0.0) + weight / sum(weights)
     ranked = sorted(total.items(), key=lambda pair: -pair[1])
     # Models of negligible weight would fill most of the file.
     return [

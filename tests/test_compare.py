@@ -106,7 +106,8 @@ def test_a_fit_brings_its_window(loop, recordings):
 
 
 def test_tracking_compares_torques_that_passed_the_same_low_pass(loop, recordings):
-    tracking = dataclasses.replace(loop, controller=Tracking(cutoff=5.0, still=0.0))
+    every = jaxid.Standstill(still=0.0)
+    tracking = dataclasses.replace(loop, controller=Tracking(cutoff=5.0), standstill=every)
     found = jaxid.compare(tracking, recordings)
     time, measured, simulated = found.judged(0)
     # Two periods of the cutoff are lost at each end.

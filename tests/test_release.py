@@ -120,11 +120,10 @@ def test_where_a_joint_stands_still_its_torque_is_not_compared():
     held = 2.0 * np.sin(time) * ~moving  # what friction lets the drive do at rest
     tau = np.sign(np.gradient(q)) * 1.0 * moving + held
     record = jaxid.Recording.from_arrays(time, q, tau + 1e-3 * np.cos(40 * time))
-    found = Tracking(cutoff=20.0).moving(record, 20.0)
-    assert found is not None
+    found = jaxid.Standstill().moving(record, 20.0)
     away = np.abs(time[:, None] - [1, 3, 5, 6]).min(axis=1) > 0.1
     np.testing.assert_array_equal(found[away, 0], moving[away])
-    assert Tracking(still=0.0).moving(record, 20.0) is None
+    assert jaxid.Standstill(still=0.0).moving(record, 20.0).all()
     law = Tracking(cutoff=20.0)
     loop = jaxid.ClosedLoop(jaxid.arms.Axis(), law, (Viscous(1), Coulomb(1)), name="axis")
     fit = jaxid.fit(loop, record, jaxid.OEM(progress=False))

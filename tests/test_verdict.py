@@ -86,13 +86,21 @@ def test_what_noise_does_not_account_for_is_no_verdict(found):
 def test_a_start_that_shares_the_weight_is_undecided():
     start, rival = Model((), 100.0), Model((TorqueOffset(joint=2),), 98.0)
     models = [dataclasses.replace(rival, weight=0.73), dataclasses.replace(start, weight=0.27)]
-    assert "only 2 larger" in undecided(models, rival)
+    assert "only 2 larger" in undecided(models, rival, {})
     sure = dataclasses.replace(rival, score=90.0)
-    assert undecided([sure, start], sure) == ""
+    sure = dataclasses.replace(sure, weight=0.9)
+    assert undecided([sure, start], sure, {}) == ""
+    # Models without the effect have more weight, unless their effect is indistinguishable.
+    other = Model((Spring(joint=1),), 80.0, weight=0.99)
+    models = [other, dataclasses.replace(sure, weight=0.01), start]
+    said = undecided(models, sure, {})
+    assert "without torque_offset on joint 2 have a probability of 0.99" in said
+    assert "spring on joint 1" in said
+    assert undecided(models, sure, {("torque_offset", 2): [("spring", 1)]}) == ""
     alone = [dataclasses.replace(start, weight=0.9), dataclasses.replace(rival, weight=0.1)]
-    assert undecided(alone, alone[0]) == ""
+    assert undecided(alone, alone[0], {}) == ""
     crowd = [dataclasses.replace(start, weight=0.4), Model((Spring(joint=1),), 101, weight=0.3)]
-    assert "spring on joint 1" in undecided(crowd, crowd[0])
+    assert "spring on joint 1" in undecided(crowd, crowd[0], {})
 
 
 def test_a_fit_that_leaves_a_third_says_what_to_check(found):

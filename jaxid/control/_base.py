@@ -7,7 +7,7 @@ from typing import Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ..errors import ModelError
 from ..recording import Recording
@@ -112,17 +112,6 @@ class AbstractController(eqx.Module):
 
         If there is one, the same low-pass is applied to both, the ends of a recording are left out,
         and the loop starts on its reference.
-        """
-        return None
-
-    def moving(
-        self, recording: Recording, cutoff: float
-    ) -> Bool[np.ndarray, "samples joints"] | None:
-        """At which samples a joint's torque may be compared; None for all.
-
-        **Arguments:**
-
-        - `cutoff`: frequency up to which measured and simulated torque are compared, Hz.
         """
         return None
 

@@ -3,11 +3,10 @@
 import dataclasses
 import math
 from collections.abc import Iterable
-from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ..recording import Recording
 from ..signals.smoothing import even_times, resampled, signal_cutoff, smooth_motion
@@ -33,22 +32,12 @@ class Tracking(AbstractController):
       is computed at every sample and held in between.
     - `cutoff`: cutoff of the low-pass, Hz. By default the frequency above which the recorded motion
       is noise; a fit uses the lowest of its recordings.
-    - `still`: share of its highest speed below which a joint counts as standing still, one for all
-      joints or one per joint. Motion does not determine static friction, which may be any torque up
-      to the breakaway torque. The torque of such samples is therefore not compared. Zero compares
-      all samples. By default it is a hundredth; a fit raises it if torque at low speed is no
-      function of motion.
-    - `reach`: time from such samples within which torque is not compared either, in periods of the
-      cutoff, or of 30 ms if they are shorter; one for all joints or one per joint. By default one;
-      a fit raises it to two if the low-pass visibly spreads a jump of friction further.
     """
 
     bandwidth: float = 40.0
     damping: float = 1.0
     cutoff: float | None = eqx.field(static=True, default=None)
     delay: float = eqx.field(static=True, default=0.0)
-    still: float | Float[Any, " joints"] | None = None
-    reach: float | Float[Any, " joints"] | None = None
 
     @property
     def pace(self) -> float:
@@ -76,36 +65,9 @@ class Tracking(AbstractController):
         """Cutoff of the low-pass, Hz."""
         return self.cutoff or signal_cutoff(recording)
 
-    def moving(
-        self, recording: Recording, cutoff: float
-    ) -> Bool[np.ndarray, "samples joints"] | None:
-        """Samples at which a joint moves and has moved for the length of the low-pass.
-
-        If a joint reverses so often that few samples remain, samples nearer to a reversal are used.
-        """
-        still = STILL if self.still is None else np.asarray(self.still)
-        if np.all(still <= 0):
-            return None
-        time = even_times(recording)
-        speed = np.gradient(smooth_motion(recording, cutoff), time, axis=0)
-        standing = np.abs(speed) < still * np.abs(speed).max(axis=0)
-        # A fast reversal may be between two samples.
-        turns = speed[1:] * speed[:-1] < 0
-        standing[1:] |= turns
-        standing[:-1] |= turns
-        memory = recording.rate * max(1 / cutoff, _PRESLIDING)
-        reach = np.zeros(len(standing.T)) + np.asarray(REACH if self.reach is None else self.reach)
-        pairs = zip(standing.T, memory * reach, strict=True)
-        return np.stack([_far_from(column, span) for column, span in pairs], axis=1)
-
     def settled(self, recordings: Iterable[Recording]) -> "Tracking":
-        """The controller with the lowest cutoff of all recordings, and settings of each joint."""
-        recordings = list(recordings)
-        each = np.zeros(recordings[0].q.shape[1])
-        still = each + np.asarray(STILL if self.still is None else self.still)
-        reach = each + np.asarray(REACH if self.reach is None else self.reach)
-        cutoff = min(map(self.comparable, recordings))
-        return dataclasses.replace(self, cutoff=cutoff, still=still, reach=reach)
+        """The controller with the lowest cutoff of all recordings."""
+        return dataclasses.replace(self, cutoff=min(map(self.comparable, recordings)))
 
     def signals(self, recording: Recording) -> Signals:
         """The low-passed recorded motion, `(samples, joints)`."""
@@ -115,29 +77,3 @@ class Tracking(AbstractController):
         at = np.clip(recording.time + self.delay, times[0], times[-1])
         q = resampled(times, smooth, at)
         return Signals(q, np.zeros_like(recording.tau))
-
-
-# Share of its highest speed below which a joint stands still.
-STILL = 0.01
-# Reach of standstill in periods of the cutoff. After one period the low-pass leaves about a
-# hundredth of a jump of friction, after two periods a thousandth.
-REACH = 1.0
-# Time in which dry friction builds up after a reversal, s, for any cutoff.
-_PRESLIDING = 0.03
-# Smallest share of a joint's moving samples that is compared.
-_LEAST = 0.6
-
-
-def _far_from(there: Bool[np.ndarray, " samples"], reach: float) -> Bool[np.ndarray, " samples"]:
-    """Samples further than a reach from marked ones, with a shorter reach if few remain."""
-    import scipy
-
-    if there.mean() > 0.95:
-        # The joint does not move: only its noise can be compared.
-        return np.ones_like(there)
-    for part in (1.0, 0.5, 0.25):
-        width = 2 * round(part * reach) + 1
-        found = ~scipy.ndimage.binary_dilation(there, np.ones(width, bool))
-        if found.sum() > _LEAST * (~there).sum():
-            return found
-    return ~there

@@ -12,6 +12,7 @@ from ..effects import AbstractEffect
 from ..effects import catalogue as known
 from ..errors import FitError
 from ..estimate import OEM, Status
+from ..estimate.standstill import slow_note, worst_at_standstill
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
@@ -97,13 +98,31 @@ def discover(
         ) as campaign,
     ):
         search = Search(asked, campaign, say, live_figure(progress))
+        story = _searched(search, loop, started)
+        if story.verdict != "undetermined" or story.interrupted:
+            return story
+        slower = worst_at_standstill(story.fit)
+        if slower is None:
+            return story
+        moving = dataclasses.replace(loop, standstill=slower)
+        search = Search(asked, campaign, say, live_figure(progress), prefix="moving, ")
         try:
-            verdict, unfinished = search.run(loop)
+            story = _searched(search, moving, started)
         except KeyboardInterrupt:
-            if not search.stopped():
-                raise
-            return _told(search, "undetermined", False, started, interrupted=True)
-        return _told(search, verdict, unfinished, started)
+            return dataclasses.replace(story, interrupted=True, reason=_STOPPED)
+        notes = (*story.notes, *slow_note(loop.standstill, moving))
+        return dataclasses.replace(story, notes=notes)
+
+
+def _searched(search: Search, loop: ClosedLoop, started: float) -> Discovery:
+    """The result of a search; if it is interrupted, that of the best fitted model."""
+    try:
+        verdict, unfinished = search.run(loop)
+    except KeyboardInterrupt:
+        if not search.stopped():
+            raise
+        return _told(search, "undetermined", False, started, interrupted=True)
+    return _told(search, verdict, unfinished, started)
 
 
 def _told(
@@ -145,17 +164,18 @@ def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step], models: Sequ
     assert last.diagnosis is not None
     worth = search.asked.worth
     refutation = refuted(last.fit, search.at.noise, last.diagnosis, both, worth)
-    return refutation or undecided(models, search.at)
+    alike = {named(s.added): s.alike for s in steps if s.added is not None}
+    return refutation or undecided(models, search.at, alike)
 
 
 def _raised(search: Search, steps: Sequence[Step]) -> str:
     """A reason that names the effects that raised the held-out error; empty if none did."""
     seen = [(s.label, s.held_out) for s in steps if s.held_out is not None]
-    noise = search.at.noise
-    if len(seen) < 2 or not (reason := risen(seen[0][1], seen[-1][1], noise)):
+    noise, worth = search.at.noise, search.asked.worth
+    if len(seen) < 2 or not (reason := risen(seen[0][1], seen[-1][1], noise, worth)):
         return ""
     pairs = itertools.pairwise(seen)
-    culprits = [label for (_, one), (label, other) in pairs if risen(one, other, noise)]
+    culprits = [label for (_, one), (label, other) in pairs if risen(one, other, noise, worth)]
     # The names of all added effects would not add to the reason.
     some = 0 < len(culprits) < len(seen) - 1
     said = f"; it rose with {joined([x.removeprefix('+ ') for x in culprits])}"

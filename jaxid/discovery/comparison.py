@@ -67,7 +67,7 @@ class Comparison(AbstractShown):
         """Time, measured and simulated signal as they are compared, `(samples, joints)`.
 
         If the control law is unknown, both signals are low-passed and their ends are removed. They
-        are zero while a joint is at rest.
+        are zero while a joint is at rest, if its standstill is left out.
 
         **Arguments:**
 
@@ -78,10 +78,10 @@ class Comparison(AbstractShown):
         if self.signal == "position":
             return record.time, record.q, np.asarray(run.q)
         band = band_of(self.loop, self.recordings)
-        if band is None:
-            return record.time, record.tau, np.asarray(run.tau)
         pair = [r.tau for r in self.recordings], [np.asarray(x.tau) for x in self.runs]
         measured, simulated = (compared(self.loop, self.recordings, x)[k] for x in pair)
+        if band is None:
+            return record.time, measured, simulated
         rows = np.asarray(band.rows)[k][np.asarray(band.keep)[k]]
         return record.time[rows], measured, simulated
 

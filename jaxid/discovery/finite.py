@@ -1,6 +1,5 @@
 """Effects without a derivative at zero: each is simulated at a finite size."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -112,7 +111,7 @@ def _simulated(
             rows = np.minimum(np.arange(first, first + _AT_ONCE), len(places) - 1)
             stacked = jax.tree.map(lambda *x: np.stack(x), *(settings[k] for k in rows))
             jobs.append(([places[k] for k in rows], stacked))
-    batch = dataclasses.replace(batch, band=None)
+    batch = batch.uncompared()
 
     def with_them(job):
         return one_by_one(lambda one: _with_effects(loop, job[1], one, row), batch)

@@ -6,10 +6,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..control import Tracking
 from ..noise import Level, above_motion, from_repeats
 from ..recording import Recordings
 from ..signals.smoothing import signal_cutoff
+from ..signals.standstill import Standstill
 from ..simulation.batch import band_of, compared
 from ..simulation.loop import ClosedLoop
 
@@ -52,8 +52,7 @@ def floor_of(loop: ClosedLoop, recordings: Recordings) -> Floor | None:
     levels: list[tuple[Level | None, ...]] = []
     for k, r in enumerate(recordings):
         cutoff = loop.controller.comparable(r) or signal_cutoff(r)
-        moving = Tracking().moving(r, cutoff)
-        assert moving is not None
+        moving = Standstill().moving(r, cutoff)
         share = 1.0 if band is None else float(np.mean(np.asarray(band.gain[k]) ** 2))
         above = above_motion(r, cutoff, moving, share)
         pairs = zip(repeats.get(r.name, above), above, strict=True)

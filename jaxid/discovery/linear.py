@@ -51,7 +51,7 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
 
     - `output`: which of `SIGNALS` is compared.
     """
-    batch = dataclasses.replace(batch, band=None)
+    batch = batch.uncompared()
     return one_by_one(lambda one: _linearised(loop, one, output), batch)
 
 

@@ -222,9 +222,15 @@ class Visited:
         )
 
 
-def probability(models: Iterable[Model], name: Named) -> float:
-    """Total weight of all models with an effect (Madigan and Raftery 1994)."""
-    return float(sum(m.weight for m in models if name in m.names))
+def probability(models: Iterable[Model], *names: Named) -> float:
+    """Share of the models with one of the effects in the weight of all models without a curve.
+
+    A free-form curve describes the same torque as an effect and does not contradict it (Madigan and
+    Raftery 1994).
+    """
+    plain = [m for m in models if m.curve is None]
+    shares = weights([m.score for m in plain])
+    return float(sum(w for m, w in zip(plain, shares, strict=True) if set(names) & set(m.names)))
 
 
 def worth_keeping(models: Sequence[Model]) -> tuple[Model, ...]:

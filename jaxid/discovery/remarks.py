@@ -21,7 +21,7 @@ def remarks(steps: Sequence[Step], given: ClosedLoop) -> tuple[str, ...]:
     bad = [s.label for s in steps if not s.fit.succeeded]
     said = [f"the fit of {', '.join(bad)} did not converge: use its values with care"]
     last = steps[-1].fit
-    more = (*_estimated(last, given), *slow_note(given.controller, last.loop), *looks_sampled(last))
+    more = (*_estimated(last, given), *slow_note(given.standstill, last.loop), *looks_sampled(last))
     return (*(said if bad else ()), *more)
 
 

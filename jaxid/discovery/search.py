@@ -8,24 +8,28 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
 
 from ..effects import AbstractEffect
 from ..errors import FitError, ModelError
 from ..estimate import Fit
+from ..noise import ARFilter
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
 from .asked import Asked
 from .diagnosis import Diagnosis, over_recordings, share_left
 from .explore import DECISIVE, Candidate, explore, key_of
+from .fits import Fits, released_names
 from .landscape import Landscape, form, forms_of
 from .likelihood import price, score_of
-from .models import Model, Named, Visited, listed, piece_name
+from .models import Model, Named, Visited, listed
+from .predict import Predictor
 from .ranking import Screened, judge
 from .release import released
+from .relevance import loses, matters
 from .screening import carried, screen
 from .support import unsupported
+from .system import System
 from .verdict import Outcome
 from .verify import Refits, is_there, needed
 from .watched import ROUND, Watched
@@ -35,12 +39,11 @@ from .watched import ROUND, Watched
 _VERIFIED, _INEXACT = 3, 0.08
 # Largest number of predicted sets among which those are searched.
 _EXAMINED = 12
+# Largest number of predicted models that are fitted because they may replace the chosen one.
+_RIVALS = 2
 # Largest number of effects in a predicted set. What sets of two explain is predicted to a few per
 # cent; larger sets are searched from the next fit.
 _AHEAD = 2
-# Smallest relevant effect if the law is unknown, as a share of the residual: filters on motion and
-# torque, ticks and stiction cause errors of this size even in good recordings.
-_BLURRED = 0.25
 
 
 class Search:
@@ -51,6 +54,7 @@ class Search:
     - `asked`: the arguments of the discovery.
     - `campaign`: saved steps.
     - `say`: function that reports an activity. `draw`: function that draws a figure.
+    - `prefix`: of the names of saved steps.
     """
 
     def __init__(
@@ -59,9 +63,10 @@ class Search:
         campaign: Campaign,
         say: Callable[..., None],
         draw: Callable[[Callable[[], Any]], None] = lambda make: None,
+        prefix: str = "",
     ) -> None:
-        self.asked, self.campaign, self.watched = asked, campaign, Watched(say, draw)
-        self.refits = Refits(asked.recordings, asked.method)
+        self.asked, self.watched = asked, Watched(say, draw)
+        self.fits = Fits(Refits(asked.recordings, asked.method), campaign, prefix)
         self.visited = Visited()
         self.forms = 0
         self.removed: tuple[Named, ...] = ()
@@ -86,6 +91,8 @@ class Search:
                 gone = [n for n in at.names if n not in better.names]
                 self.removed = (*self.removed, *gone)
             if better is None:
+                better = self._replaced(at)
+            if better is None:
                 break
             at = better
         self.at = at
@@ -106,17 +113,13 @@ class Search:
     def _start(self, loop: ClosedLoop) -> Model:
         """The starting model, fitted with noise filters."""
         self.watched.begin("fit", "fit of the starting model")
-        first = self.campaign.piece("start", lambda: self.refits.first(loop))
-        # A recording along which the first fit diverges is left out from here on.
-        self.refits = dataclasses.replace(self.refits, recordings=first.recordings)
+        first = self.fits.start(loop)
         screened, diagnosis = self._screened(first, ())
         # If noise is strongly coloured, plain output error is imprecise. A filter that is estimated
         # from the residual itself would model a missing effect as noise, so that of the diagnosis
         # is used.
         self.watched.begin("fit", "fit of the starting model with noise filters")
-        again = self.campaign.piece(
-            "start, filtered", lambda: self.refits.filtered(first.loop, diagnosis.noise)
-        )
+        again = self.fits.start_filtered(first, diagnosis.noise)
         again = dataclasses.replace(again, notes=(*first.notes, *again.notes))
         fit = again if again.succeeded else first
         if fit is first:
@@ -150,25 +153,46 @@ class Search:
         candidates = explore(landscape, left, self.watched.say)
         self.seen = at.fit, landscape.predictor
         plain = next(c for c in candidates if not c.effects and c.curve is None)
-        return [c for c in candidates if c is plain or self._matters(at, c, plain)], plain.score
+        worth = self.asked.worth
+        kept = [c for c in candidates if c is plain or matters(at, c, plain, worth)]
+        return kept, plain.score
 
     def _released(self, at: Model, candidates: Sequence[Candidate], nothing: float) -> Model | None:
         """The model with released values, if that lowers its score; otherwise None.
 
         Released values are tried before effects. If a law is simulated, each release compiles a
-        program, so a single effect that explains more is tried first.
+        program, so a single effect that explains more is tried first. Along an imposed motion,
+        values are released until none explains its price, before signatures are computed again.
         """
         fit, predictor = self.seen
-        value = np.log(predictor.data.mask.sum() * fit.loop.joints)
-        release = released(predictor, value + DECISIVE)
+        along, noise = imposed(fit.loop), candidates[0].noise
         single = [c.score for c in candidates if c.size == 1]
-        effect = 0.0 if imposed(fit.loop) else max(nothing - min(single, default=np.inf), 0.0)
+        effect = 0.0 if along else max(nothing - min(single, default=np.inf), 0.0)
+        found = at
+        while (better := self._release(found, predictor, noise, effect)) is not None:
+            found = better
+            if not along:
+                break
+            assert found.fit is not None
+            predictor = Predictor.of(System.of(found.fit), noise, predictor.data.level)
+        return None if found is at else found
+
+    def _release(
+        self, at: Model, predictor: Predictor, noise: Sequence[ARFilter], effect: float
+    ) -> Model | None:
+        """The model with the values free that explain most, if that lowers its score.
+
+        **Arguments:**
+
+        - `predictor`: the linear system of the model. `noise`: the filters of the fit.
+        - `effect`: decrease of the score by the best single effect.
+        """
+        value = np.log(predictor.data.mask.sum() * predictor.system.loop.joints)
+        release = released(predictor, value + DECISIVE)
         if release is None or release.gain < effect:
             return None
         self.watched.begin("fit", f"fit with {release.said}", ROUND)
-        loop, noise = release.loop, candidates[0].noise
-        name = f"{piece_name(at.effects)}, {release.said}"
-        found = self.campaign.piece(name, lambda: self.refits.filtered(loop, noise))
+        found = self.fits.with_released(at.effects, release, noise)
         if not found.status.simulated:
             return None
         model = self._judged(self._added(found), found)
@@ -239,10 +263,7 @@ class Search:
             return had
         self.watched.begin("fit", f"fit with {listed(asked.effects)}", ROUND)
         try:
-            fit = self.campaign.piece(
-                piece_name(together),
-                lambda: self.refits.with_effects(before, asked.effects, asked.noise, promised),
-            )
+            fit = self.fits.with_effects(before, at.effects, asked.effects, asked.noise, promised)
         except (ModelError, FitError) as error:
             # The candidate cannot be simulated at the predicted values.
             self.failures = (*self.failures, f"no fit with {listed(asked.effects)}: {error}")
@@ -258,7 +279,7 @@ class Search:
             return None
         one, other = had.fit.loop, at.fit.loop
         alike = bool(eqx.tree_equal(one.controller, other.controller))
-        return had if alike and _released(one) == _released(other) else None
+        return had if alike and released_names(one) == released_names(other) else None
 
     def _without_one(self, at: Model) -> Model | None:
         """The model without one of its effects; None if all are needed.
@@ -278,31 +299,46 @@ class Search:
         best = min(found, key=lambda m: m.score, default=at)
         if best.score < at.score:
             return best
-        small = [m for m in found if not self._loses(m, at)]
+        small = [m for m in found if not loses(m, at, self.asked.worth)]
         best = min(small, key=lambda m: m.score, default=None)
         if best is not None:
             # The removed effect is too small to matter, also in other sets.
             self.visited.forget(set(at.key) - set(best.key))
         return best
 
-    def _loses(self, less: Model, at: Model) -> bool:
-        """Whether a smaller model raises a joint's error by a relevant amount."""
-        assert less.left is not None
-        assert at.left is not None
-        lost = np.sqrt(np.maximum(less.left**2 - at.left**2, 0.0))
-        return bool(np.any(lost > self._worth(at, at.left)))
-
     def refitted(self, at: Model, effects: Sequence[AbstractEffect]) -> Model:
         """A fitted model with only some of its effects, fitted again from their current values."""
         assert at.fit is not None
-        loop, noise = at.fit.loop, at.noise
-        kept = [e for e in loop.effects if not any(e is x for x in at.effects)]
         self.watched.begin("fit", f"fit with {listed(effects) or 'nothing'} alone")
-        fit = self.campaign.piece(
-            piece_name(effects),
-            lambda: self.refits.filtered(loop.with_effects((*kept, *effects)), noise),
-        )
+        fit = self.fits.alone(at.fit.loop, at.effects, effects, at.noise)
         return self._visit(self._added(fit), fit)
+
+    def _replaced(self, at: Model) -> Model | None:
+        """The best fit of a model with another effect in the place of one, if it is better.
+
+        Predictions are inexact, so a predicted model that is not decisively worse may be better.
+        """
+        assert at.fit is not None
+        own, best = Counter(map(form, at.effects)), at
+        near = self.visited.ranked(
+            lambda m: m.fit is None and m.curve is None and m.score < at.score + DECISIVE
+        )
+        rivals = [
+            m
+            for m in near
+            if len(m.effects) == len(at.effects)
+            and (Counter(map(form, m.effects)) - own).total() == 1
+        ]
+        for rival in rivals[:_RIVALS]:
+            self.watched.begin("fit", f"fit with {listed(rival.effects)} instead", ROUND)
+            try:
+                fit = self.fits.instead(at.fit.loop, at.effects, rival.effects, rival.noise)
+            except (ModelError, FitError) as error:
+                self.failures = (*self.failures, f"no fit with {rival.label}: {error}")
+                continue
+            if fit.status.simulated:
+                best = min(best, self._visit(self._added(fit), fit), key=lambda m: m.score)
+        return None if best is at else best
 
     def _visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
         """A fitted model, which is stored and drawn."""
@@ -323,31 +359,6 @@ class Search:
         assert start is not None
         assert start.fit is not None
         return fit.loop.effects[len(start.fit.loop.effects) :]
-
-    def _matters(self, at: Model, c: Candidate, plain: Candidate) -> bool:
-        """Whether a set changes a joint's residual by more than the smallest relevant change."""
-        assert at.fit is not None
-        if at.fit.error_percent.to_numpy().max() < 1e-3:
-            # Recordings without noise: the residual is the error of the integration.
-            return False
-        # Relative to the residual of the fit, whose relative error is known.
-        left = np.linalg.norm(np.concatenate(at.fit.residuals), axis=0)
-        changed = np.linalg.norm((c.rest - plain.rest).reshape(-1, c.rest.shape[-1]), axis=0)
-        percent = over_recordings(at.fit.error_percent.to_numpy())
-        return bool(np.any(changed * percent > self._worth(at, percent) * left))
-
-    def _worth(
-        self, at: Model, percent: Float[np.ndarray, " joints"]
-    ) -> Float[np.ndarray, " joints"]:
-        """Smallest relevant change of each joint's torque, %.
-
-        **Arguments:**
-
-        - `percent`: relative error of each joint's torque, %.
-        """
-        assert at.fit is not None
-        least = _BLURRED if imposed(at.fit.loop) else 0.0
-        return np.maximum(self.asked.worth, least * percent)
 
     def _left_by(self, c: Candidate) -> np.ndarray:
         """Relative error by joint of a set that was predicted in the last round, %."""
@@ -385,8 +396,3 @@ class Search:
                 left[form(effect)] -= 1
                 part.append(effect)
         return self.refitted(self.at, part)
-
-
-def _released(loop: ClosedLoop) -> set[str]:
-    """Names of free parameters that are held by declaration."""
-    return {p.name for p in loop.free_parameters if not p.declaration.free}

@@ -1,6 +1,6 @@
 """Tests that the final model must pass; otherwise the verdict is `undetermined`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -15,7 +15,8 @@ from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
 from .explore import DECISIVE
 from .floor import SPOKEN, Floor, floor_of
-from .models import LIKELY, Model
+from .hypotheses import effect_on
+from .models import LIKELY, Model, Named, probability
 from .score import spanned
 from .system import System
 
@@ -50,8 +51,16 @@ def _to_check(fit: Fit) -> str:
     )
 
 
-def undecided(models: Sequence[Model], chosen: Model) -> str:
-    """The reason if scores do not decide between starting and chosen model; empty if they do."""
+def undecided(
+    models: Sequence[Model], chosen: Model, alike: Mapping[Named, Sequence[Named]]
+) -> str:
+    """The reason if scores do not decide for the chosen model; empty if they do.
+
+    **Arguments:**
+
+    - `alike`: for each effect of the chosen model, the effects that these recordings cannot
+      distinguish from it.
+    """
     start = next(m for m in models if not m.effects and m.curve is None)
     if not chosen.effects:
         if start.weight >= _HALF:
@@ -62,11 +71,28 @@ def undecided(models: Sequence[Model], chosen: Model) -> str:
             f"{rival.label} has {rival.weight:.2g}: record more, or longer"
         )
     if chosen.score < start.score - LIKELY:
-        return ""
+        return _improbable(models, chosen, alike)
     return (
         f"the score of the starting model is only {start.score - chosen.score:.2g} larger "
         f"({LIKELY:.0f} are odds of 20 to 1): record more, or longer"
     )
+
+
+def _improbable(
+    models: Sequence[Model], chosen: Model, alike: Mapping[Named, Sequence[Named]]
+) -> str:
+    """The reason if an effect of the chosen model is improbable; empty if none is."""
+    for name in chosen.names:
+        group = {name, *alike.get(name, ())}
+        share = probability(models, *group)
+        if share < _HALF:
+            plain = [m for m in models if m.curve is None]
+            rival = next(m for m in plain if not group.intersection(m.names))
+            return (
+                f"models without {effect_on(*name)} have a probability of {1 - share:.3g}, most of "
+                f"all {rival.label}: record other motions, or choose a model from the table"
+            )
+    return ""
 
 
 def refuted(
@@ -101,7 +127,7 @@ def refuted(
         return reason
     before, after = held_out
     return (
-        risen(before, after, noise)
+        risen(before, after, noise, worth)
         or _above_noise(chosen, after, noise, worth)
         or _above_measured(after, floor_of(after.loop, after.recordings), worth)
     )
@@ -195,13 +221,14 @@ def _above_measured(fit: Fit | Comparison, floor: Floor | None, worth: float) ->
     )
 
 
-def risen(before: Comparison, after: Comparison, noise: Sequence[ARFilter]) -> str:
+def risen(before: Comparison, after: Comparison, noise: Sequence[ARFilter], worth: float) -> str:
     """The reason if added effects raised the error on held-out recordings; empty if not.
 
     **Arguments:**
 
     - `before`, `after`: comparisons of the models without and with the added effects.
     - `noise`: noise filters of the residual of the later model, one per output.
+    - `worth`: smallest relevant change, in % of a joint's torque.
     """
     errors = [over_recordings(c.error_percent.to_numpy()) for c in (before, after)]
     for j, filt in enumerate(noise):
@@ -211,7 +238,7 @@ def risen(before: Comparison, after: Comparison, noise: Sequence[ARFilter]) -> s
         moved = sum(float(d @ d) for d in changed)
         # Twice the standard deviation of the sum of noise times change, whose mean is zero.
         chance = 2 * np.sqrt(sum(_through(filt, d) for d in changed))
-        if rise > 0 and rise + moved > _ROSE * chance:
+        if errors[1][j] - errors[0][j] > worth and rise + moved > _ROSE * chance:
             label = joint_columns(after.loop.joints)[j]
             return (
                 f"the added effects raised the error of {label} on held-out recordings from "

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..arms import SerialArm, physical_bodies
-from ..control import Reading, Sampled, Tracking
+from ..control import Reading, Sampled
 from ..effects import AbstractEffect, AbstractTransmission, check_declared
 from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
@@ -43,8 +43,10 @@ def fit(
     recordings = Recordings.of(recordings)
     check_joints(loop, recordings[0])
     check_law(loop)
-    law = loop.controller
+    law, given = loop.controller, loop.standstill
     loop = dataclasses.replace(loop, controller=law.settled(recordings))
+    if law.imposes:
+        loop = dataclasses.replace(loop, standstill=given.settled(loop.joints, imposed=True))
     for effect in loop.effects:
         check_declared(effect, loop.joints)
     method = OEM() if method is None else method
@@ -57,15 +59,14 @@ def fit(
     if method.rigid:
         _check_rigid(loop, method)
     found = method.fit(loop, recordings)
-    chosen = isinstance(law, Tracking) and law.still is None and law.reach is None
-    while chosen and found.succeeded and (faster := raised(found)) is not None:
-        again = method.fit(dataclasses.replace(loop, controller=faster), recordings)
+    while given.chosen and found.succeeded and (slower := raised(found)) is not None:
+        again = method.fit(dataclasses.replace(loop, standstill=slower), recordings)
         if not again.succeeded:
             break
         found = again
     found = _followed(_doubted(_without_nan(found)))
-    notes = (*found.notes, *_matter(found), *_band(loop, recordings), *slow_note(law, found.loop))
-    notes = (*notes, *_gaps(recordings))
+    notes = (*found.notes, *_matter(found), *_band(loop, recordings))
+    notes = (*notes, *slow_note(given, found.loop), *_gaps(recordings))
     notes = (*notes, *_restarted(loop, recordings))
     return dataclasses.replace(found, notes=notes)
 

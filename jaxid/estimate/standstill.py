@@ -6,13 +6,12 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..control import AbstractController, Tracking
-from ..control.tracking import STILL
 from ..recording import Recording
-from ..signals.smoothing import even_times, smooth_motion
+from ..signals.smoothing import even_times, signal_cutoff, smooth_motion
+from ..signals.standstill import STILL, Standstill
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
-from .result import Fit
+from .result import Fit, Status
 
 # Factor on the share of the highest speed, the largest share (more would leave out motion), and the
 # largest reach in periods of the cutoff.
@@ -26,8 +25,8 @@ _FEW = 80
 _SPEEDS, _DISTANCES = np.geomspace(0.1, 10, 9), np.geomspace(1e-3, 1, 8)
 
 
-def raised(found: Fit) -> Tracking | None:
-    """The controller with a larger `still` or `reach` for joints whose torque is not described.
+def raised(found: Fit) -> Standstill | None:
+    """Settings with a larger `still` or `reach` for joints whose torque is not described.
 
     Static friction is no function of motion. A joint that creeps or sticks below a speed leaves
     residuals there that bend the whole model, and the low-pass spreads them. The residual of the
@@ -41,42 +40,76 @@ def raised(found: Fit) -> Tracking | None:
 
     **Returns:** None if no joint needs it.
     """
-    law, optimum = found.loop.controller, found.optimum
-    if not isinstance(law, Tracking) or law.cutoff is None or optimum is None:
+    loop = found.loop
+    if not (loop.controller.imposes and imposed(loop) and _has_rows(found)):
         return None
-    band = optimum.problem.batch.band
-    if not imposed(found.loop) or band is None or len(band.rows) != len(found.recordings):
-        return None
-    keep = np.asarray(band.keep)
-    rows = [np.asarray(row)[there] for row, there in zip(band.rows, keep, strict=True)]
-    still, reach = (np.array(x) for x in (law.still, law.reach))
+    here = loop.standstill
+    still, reach = (np.array(x) for x in (here.still, here.reach))
     slower = np.where(still * _FACTOR <= _LARGEST, still * _FACTOR, still)
     # The reach first: samples beside standstill would count as slow ones that are not described.
     for name, before, after in (
         ("reach", reach, np.full_like(reach, _FARTHEST)),
         ("still", still, slower),
     ):
-        proposed = dataclasses.replace(law, **{name: after})
-        needed = _undescribed(found, proposed, rows) & (after > before)
+        needed = _undescribed(found, dataclasses.replace(here, **{name: after})) & (after > before)
         if needed.any():
-            return dataclasses.replace(law, **{name: np.where(needed, after, before)})
+            return dataclasses.replace(here, **{name: np.where(needed, after, before)})
     return None
 
 
-def slow_note(given: AbstractController, loop: ClosedLoop) -> list[str]:
+def worst_at_standstill(found: Fit) -> Standstill | None:
+    """Settings that leave out the standstill of joints whose torque is described worst there.
+
+    Under a simulated law all samples are compared, because backlash or elasticity that a model
+    lacks are visible at reversals. If no model describes them, the friction at standstill is of
+    another kind.
+
+    **Arguments:**
+
+    - `found`: a fit under a simulated law.
+
+    **Returns:** None if no joint needs it, if the settings were given, and for a misfit.
+    """
+    loop = found.loop
+    if loop.controller.imposes or not loop.standstill.chosen or not _has_rows(found):
+        return None
+    if found.status is Status.misfit:
+        return None
+    usual = Standstill().settled(loop.joints, imposed=True)
+    motions = [_motion(r, _cutoff(found)) for r in found.recordings]
+    rest, slow, speed, _ = _slow(found, usual, motions)
+    fast = (rest != 0) & ~slow & (np.abs(speed) > _LARGEST)
+    counts = [np.sum(there, axis=0) for there in (slow, fast)]
+    powers = [
+        np.sum(rest**2 * there, axis=0) / np.maximum(count, 1)
+        for there, count in zip((slow, fast), counts, strict=True)
+    ]
+    worse = (np.minimum(*counts) >= _FEW) & (powers[0] > _LARGER * powers[1])
+    if not worse.any():
+        return None
+    return dataclasses.replace(usual, still=np.where(worse, np.asarray(usual.still), 0.0))
+
+
+def _has_rows(found: Fit) -> bool:
+    """Whether a fit has a residual of torque with the samples of whole recordings."""
+    optimum = found.optimum
+    if optimum is None or optimum.problem.signals != ("tau",):
+        return False
+    return len(optimum.problem.batch.mask) == len(found.recordings)
+
+
+def slow_note(given: Standstill, loop: ClosedLoop) -> list[str]:
     """A note on joints whose torque is not compared at low speed because of a fit.
 
     **Arguments:**
 
-    - `given`: the controller before the fit. `loop`: the fitted loop.
+    - `given`: the settings before the fit. `loop`: the fitted loop.
     """
-    law = loop.controller
-    if not isinstance(law, Tracking) or law.still is None:
+    if given.still is not None or loop.standstill.still is None:
         return []
-    if isinstance(given, Tracking) and given.still is not None:
-        return []
-    shares = np.zeros(loop.joints) + np.asarray(law.still)
-    said = [f"{100 * x:.2g} % on joint {j + 1}" for j, x in enumerate(shares) if x > STILL]
+    shares = np.zeros(loop.joints) + np.asarray(loop.standstill.still)
+    usual = STILL if loop.controller.imposes else 0.0
+    said = [f"{100 * x:.2g} % on joint {j + 1}" for j, x in enumerate(shares) if x > usual]
     if not said:
         return []
     return [
@@ -85,26 +118,11 @@ def slow_note(given: AbstractController, loop: ClosedLoop) -> list[str]:
     ]
 
 
-def _undescribed(
-    found: Fit, proposed: Tracking, rows: Sequence[Int[np.ndarray, " _"]]
-) -> Bool[np.ndarray, " joints"]:
-    """For which joints the samples that a controller leaves out are worth leaving out.
-
-    **Arguments:**
-
-    - `rows`: the samples of each recording that the fit compares.
-    """
-    cutoff, batch = proposed.cutoff, found.optimum.problem.batch
-    assert cutoff is not None
-    motions = [_motion(r, cutoff) for r in found.recordings]
-    gone = []
-    for recording, at, rest in zip(found.recordings, rows, found.residuals, strict=True):
-        kept = proposed.moving(recording, cutoff)
-        assert kept is not None
-        gone.append((rest != 0) & ~kept[at])
-    speed = np.concatenate([v[at] for (v, _), at in zip(motions, rows, strict=True)])
-    away = np.concatenate([x[at] for (_, x), at in zip(motions, rows, strict=True)])
-    rest, left_out = np.concatenate(found.residuals), np.concatenate(gone)
+def _undescribed(found: Fit, proposed: Standstill) -> Bool[np.ndarray, " joints"]:
+    """For which joints the samples that the settings leave out are worth leaving out."""
+    batch = found.optimum.problem.batch
+    motions = [_motion(r, _cutoff(found)) for r in found.recordings]
+    rest, left_out, speed, away = _slow(found, proposed, motions)
     fast = (rest != 0) & ~left_out & (np.abs(speed) > _LARGEST)
     enough = (left_out.sum(axis=0) >= _FEW) & (fast.sum(axis=0) >= _FEW)
     larger = np.zeros(rest.shape[1], bool)
@@ -122,6 +140,41 @@ def _undescribed(
         power = left @ left / (len(r) - own.shape[1])
         larger[j] = power > _LARGER * np.mean(rest[fast[:, j], j] ** 2)
     return larger
+
+
+def _slow(
+    found: Fit, proposed: Standstill, motions: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> tuple[np.ndarray, ...]:
+    """Residual, what the settings leave out, speed over its maximum, and distance since reversal.
+
+    Each is `(samples, joints)`, for the compared samples of all recordings.
+
+    **Arguments:**
+
+    - `motions`: speed and distance along each recording.
+    """
+    parts = []
+    for recording, at, rest, (speed, away) in zip(
+        found.recordings, _compared_samples(found), found.residuals, motions, strict=True
+    ):
+        gone = (rest != 0) & ~proposed.moving(recording, _cutoff(found))[at]
+        parts.append((rest, gone, speed[at], away[at]))
+    return tuple(np.concatenate(x) for x in zip(*parts, strict=True))
+
+
+def _cutoff(found: Fit) -> float:
+    """The frequency up to which the motion of all recordings is known, Hz."""
+    law = found.loop.controller
+    return min(law.comparable(r) or signal_cutoff(r) for r in found.recordings)
+
+
+def _compared_samples(found: Fit) -> list[Int[np.ndarray, " _"]]:
+    """The samples of each recording that a fit compares."""
+    band = found.optimum.problem.batch.band
+    if band is None:
+        return [np.arange(r.samples) for r in found.recordings]
+    pairs = zip(band.rows, band.keep, strict=True)
+    return [np.asarray(rows)[np.asarray(keep)] for rows, keep in pairs]
 
 
 def _motion(

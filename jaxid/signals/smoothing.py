@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,8 +10,6 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ..errors import RecordingError
 from ..recording import Recording
-
-Moving = Callable[[Recording, float], Bool[np.ndarray, "samples joints"] | None]
 
 ORDER = 4
 # Samples per period of the cutoff; at their Nyquist frequency the filter's gain is a sixth.
@@ -128,14 +125,11 @@ class Band(eqx.Module):
 
     - `gain`: gain of the filter at the frequencies of a real Fourier transform.
     - `rows`: the samples that are compared, far enough from the ends; `keep` marks those present.
-    - `moving`: rows in which a joint moves; in the others it is not compared and its signals are
-      zero. None if all rows count.
     """
 
     gain: Float[Array, "recordings frequencies"]
     rows: Int[Array, "recordings rows"]
     keep: Bool[Array, "recordings rows"]
-    moving: Bool[Array, "recordings rows joints"] | None = None
 
     @classmethod
     def of(
@@ -143,15 +137,12 @@ class Band(eqx.Module):
         recordings: list[Recording],
         cutoffs: list[float],
         samples: int,
-        moving: Moving = lambda recording, cutoff: None,
     ) -> "Band":
         """The band of recordings padded to `samples`.
 
         **Arguments:**
 
         - `cutoffs`: frequency up to which each recording's motion is known, Hz; the lowest is used.
-        - `moving`: function of a recording and a cutoff, Hz, that gives the samples at which joints
-          move, `(samples, joints)`; None for all.
 
         **Raises:** `RecordingError` if a recording is shorter than the filter's settling time.
         """
@@ -175,10 +166,7 @@ class Band(eqx.Module):
         most = shared_length(max(len(row) for row in rows))
         keep = np.arange(most) < np.array([[len(row)] for row in rows])
         filled = np.stack([np.pad(row, (0, most - len(row)), "edge") for row in rows])
-        there = [moving(r, cutoff) for r in recordings]
-        moves = [m[row] for m, row in zip(there, filled, strict=True) if m is not None]
-        still = None if len(moves) < len(there) else jnp.asarray(np.stack(moves))
-        return cls(jnp.asarray(np.stack(gains)), jnp.asarray(filled), jnp.asarray(keep), still)
+        return cls(jnp.asarray(np.stack(gains)), jnp.asarray(filled), jnp.asarray(keep))
 
     def __call__(
         self, x: Float[Array, "recordings samples *axes"]
@@ -188,10 +176,7 @@ class Band(eqx.Module):
         size = 2 * (self.gain.shape[1] - 1)
         wave = jnp.fft.rfft(x, size, axis=1) * self.gain.reshape(*self.gain.shape, *axes)
         passed = self.picked(jnp.fft.irfft(wave, size, axis=1))
-        passed = passed * self.keep.reshape(*self.keep.shape, *axes)
-        if self.moving is None:
-            return passed
-        return passed * self.moving.reshape(*self.moving.shape, *axes[1:])
+        return passed * self.keep.reshape(*self.keep.shape, *axes)
 
     def picked(
         self, x: Shaped[Array, "recordings samples *axes"]

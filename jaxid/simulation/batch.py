@@ -1,5 +1,6 @@
 """Recordings as a batch of intervals that drive a loop, built on the host with NumPy."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from ..control import Reading, Reference
 from ..effects import recording_label
 from ..errors import JaxidError, ModelError, RecordingError
 from ..recording import Recording, Recordings
-from ..signals.smoothing import Band, shared_length
+from ..signals.smoothing import Band, shared_length, signal_cutoff
 from .loop import ClosedLoop
 
 
@@ -45,7 +46,7 @@ class Batch(eqx.Module):
     `intervals` has `(recordings, points)` before the axes of each leaf. `at` gives the grid points
     that are samples; `mask` is false for padding. The initial state is `q0`, `v0`; `q` and `tau`
     are the measured signals. `band` is the part of the signals that is compared under this
-    controller, None for all.
+    controller, and `moving` the compared rows in which a joint moves; None for all.
     """
 
     intervals: Interval
@@ -57,6 +58,7 @@ class Batch(eqx.Module):
     q: Float[Array, "recordings samples joints"]
     tau: Float[Array, "recordings samples joints"]
     band: Band | None = None
+    moving: Bool[Array, "recordings rows joints"] | None = None
 
     @property
     def kept(self) -> Bool[Array, "recordings rows"]:
@@ -66,8 +68,20 @@ class Batch(eqx.Module):
     def compared(
         self, x: Float[Any, "recordings samples *axes"]
     ) -> Float[Any, "recordings rows *axes"]:
-        """The part of signals at the samples that is compared, with zeros for missing samples."""
-        return x if self.band is None else self.band(jnp.asarray(x))
+        """The part of signals at the samples that is compared.
+
+        Missing samples, and rows in which a joint stands still, are zero.
+        """
+        passed = x if self.band is None else self.band(jnp.asarray(x))
+        if self.moving is None:
+            return passed
+        # The outputs may be several signals of each joint.
+        moving = jnp.tile(self.moving, passed.shape[2] // self.moving.shape[2])
+        return passed * moving.reshape(*moving.shape, *(1,) * (passed.ndim - 3))
+
+    def uncompared(self) -> "Batch":
+        """The batch for a simulation: what is compared would only make programs differ."""
+        return dataclasses.replace(self, band=None, moving=None)
 
 
 def _pieces(
@@ -302,6 +316,7 @@ def prepare(
         stack(lambda k, r: r.q),
         stack(lambda k, r: r.tau),
         band,
+        moving_of(loop, recordings, band),
     )
 
 
@@ -312,7 +327,30 @@ def band_of(loop: ClosedLoop, recordings: Recordings | Sequence[Recording]) -> B
     if len(given) < len(cutoffs):
         return None
     longest = shared_length(max(r.samples for r in recordings))
-    return Band.of(list(recordings), given, longest, loop.controller.moving)
+    return Band.of(list(recordings), given, longest)
+
+
+def moving_of(
+    loop: ClosedLoop, recordings: Recordings | Sequence[Recording], band: Band | None
+) -> Bool[Array, "recordings rows joints"] | None:
+    """The compared rows in which each joint moves; None for all.
+
+    **Arguments:**
+
+    - `band`: as returned by `band_of`.
+    """
+    law = loop.controller
+    standstill = loop.standstill.settled(loop.joints, law.imposes)
+    if not np.any(np.asarray(standstill.still) > 0):
+        return None
+    cutoff = min(law.comparable(r) or signal_cutoff(r) for r in recordings)
+    rows = [standstill.moving(r, cutoff) for r in recordings]
+    if band is None:
+        longest = shared_length(max(r.samples for r in recordings))
+        padded = [np.pad(m, ((0, longest - len(m)), (0, 0))) for m in rows]
+        return jax.device_put(np.stack(padded))
+    picked = [m[row] for m, row in zip(rows, np.asarray(band.rows), strict=True)]
+    return jax.device_put(np.stack(picked))
 
 
 def compared(
@@ -327,9 +365,13 @@ def compared(
     - `signals`: one for each recording, `(samples, joints)`.
     """
     band = band_of(loop, recordings)
-    if band is None:
-        return list(signals)
-    longest = max(len(x) for x in signals)
-    padded = np.stack([np.pad(x, ((0, longest - len(x)), (0, 0))) for x in signals])
-    passed, keep = np.asarray(band(jnp.asarray(padded))), np.asarray(band.keep)
-    return [x[kept] for x, kept in zip(passed, keep, strict=True)]
+    moving = moving_of(loop, recordings, band)
+    found = list(signals)
+    if band is not None:
+        longest = max(len(x) for x in found)
+        padded = np.stack([np.pad(x, ((0, longest - len(x)), (0, 0))) for x in found])
+        passed, keep = np.asarray(band(jnp.asarray(padded))), np.asarray(band.keep)
+        found = [x[kept] for x, kept in zip(passed, keep, strict=True)]
+    if moving is not None:
+        found = [x * there[: len(x)] for x, there in zip(found, np.asarray(moving), strict=True)]
+    return found

@@ -23,6 +23,7 @@ from ..parameters import (
     sliding_unit,
     write_values,
 )
+from ..signals.standstill import Standstill
 from .stepping import Stepping
 
 
@@ -39,6 +40,7 @@ class ClosedLoop(eqx.Module):
     - `freed`: places of parameters that fits estimate although they are not free by default.
     - `resolution`: step of the simulated encoders, `(joints,)`, rad or m; None for ideal ones.
     - `stepping`: how it is integrated.
+    - `standstill`: where joints count as standing still, so that their torque is not compared.
     """
 
     arm: AbstractArm
@@ -50,6 +52,7 @@ class ClosedLoop(eqx.Module):
     freed: frozenset[Place] = eqx.field(static=True, default=frozenset(), converter=frozenset)
     resolution: tuple[float, ...] | None = eqx.field(static=True, default=None)
     stepping: Stepping = Stepping()
+    standstill: Standstill = Standstill()
 
     def __post_init__(self):
         # Converters have not run yet at this point.

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from ..compiling import compiled
 from ..recording import Recording, Recordings
+from ..signals.standstill import Standstill
 from .batch import Batch, Interval, check_law, prepare
 from .dynamics import imposed
 from .integration import (
@@ -252,6 +253,6 @@ def simulate_batch(loop: ClosedLoop, batch: Batch) -> Simulated:
         # One program serves any number of steps; refining them needs no compilation.
         substeps = np.asarray(loop.stepping.substeps or 1)
         loop = set_substeps(loop, None, settled=False)
-    # What is compared does not enter, and would only make programs differ.
-    batch = dataclasses.replace(batch, band=None)
+    batch = batch.uncompared()
+    loop = dataclasses.replace(loop, standstill=Standstill())
     return jax.device_get(one_by_one(lambda one: _simulate(loop, one, substeps), batch))

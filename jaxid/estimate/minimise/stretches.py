@@ -172,6 +172,8 @@ class Stretches(eqx.Module):
             "mask": mask,
             **{name: sampled(getattr(batch, name)) for name in ("time", "q", "tau")},
         }
+        if batch.moving is not None:
+            fields["moving"] = sampled(batch.moving)
         part = Batch(q0=self.problem.batch.q0, v0=self.problem.batch.v0, **jax.device_put(fields))
         return dataclasses.replace(self.problem, batch=part), rows
 

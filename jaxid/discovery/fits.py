@@ -1,0 +1,138 @@
+"""The full fits of a search, saved under names that identify their models."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+from ..effects import AbstractEffect
+from ..estimate import Fit
+from ..noise import ARFilter
+from ..simulation.loop import ClosedLoop
+from ..storage.campaign import Campaign
+from .models import piece_name
+from .release import Release
+from .verify import Refits
+
+
+class Fits:
+    """Fits of models of one search, each read from a folder if it was saved.
+
+    **Arguments:**
+
+    - `refits`: recordings and method. `campaign`: saved steps. `prefix`: of their names.
+    """
+
+    def __init__(self, refits: Refits, campaign: Campaign, prefix: str = "") -> None:
+        self._refits, self._campaign, self._prefix = refits, campaign, prefix
+
+    def start(self, loop: ClosedLoop) -> Fit:
+        """The fit of the starting model.
+
+        A recording along which it diverges is left out from here on.
+        """
+        first = self._campaign.piece(f"{self._prefix}start", lambda: self._refits.first(loop))
+        self._refits = dataclasses.replace(self._refits, recordings=first.recordings)
+        return first
+
+    def start_filtered(self, first: Fit, noise: Sequence[ARFilter]) -> Fit:
+        """The fit of the starting model with noise filters."""
+        return self._campaign.piece(
+            f"{self._prefix}start, filtered", lambda: self._refits.filtered(first.loop, noise)
+        )
+
+    def with_released(
+        self, effects: Sequence[AbstractEffect], release: Release, noise: Sequence[ARFilter]
+    ) -> Fit:
+        """The fit of a model with released values.
+
+        **Arguments:**
+
+        - `effects`: its effects over the starting model.
+        """
+        loop = release.loop
+        name = f"{piece_name(effects)}, {release.said}"
+        return self._saved(name, loop, lambda: self._refits.filtered(loop, noise))
+
+    def with_effects(
+        self,
+        before: Fit,
+        had: Sequence[AbstractEffect],
+        more: Sequence[AbstractEffect],
+        noise: Sequence[ARFilter],
+        promised: float,
+    ) -> Fit:
+        """The best refit of a fitted model with additional effects.
+
+        **Arguments:**
+
+        - `had`: effects of the fitted model over the starting model. `more`: additional ones.
+        - `promised`: predicted decrease of the score.
+        """
+        return self._saved(
+            piece_name((*had, *more)),
+            before.loop,
+            lambda: self._refits.with_effects(before, more, noise, promised),
+        )
+
+    def alone(
+        self,
+        loop: ClosedLoop,
+        had: Sequence[AbstractEffect],
+        effects: Sequence[AbstractEffect],
+        noise: Sequence[ARFilter],
+    ) -> Fit:
+        """The fit of a model with only some of its effects.
+
+        **Arguments:**
+
+        - `had`: effects of the loop over the starting model. `effects`: those that are kept.
+        """
+        return self._saved(
+            piece_name(effects),
+            loop,
+            lambda: self._refits.filtered(_exchanged(loop, had, effects), noise),
+        )
+
+    def instead(
+        self,
+        loop: ClosedLoop,
+        had: Sequence[AbstractEffect],
+        effects: Sequence[AbstractEffect],
+        noise: Sequence[ARFilter],
+    ) -> Fit:
+        """The better one of two fits with other effects, of which one starts without filters.
+
+        **Arguments:**
+
+        - `had`: effects of the loop over the starting model. `effects`: those in their place.
+        """
+        start, refits = _exchanged(loop, had, effects), self._refits
+
+        def better() -> Fit:
+            plain = refits.unfiltered(start, noise).loop
+            return refits.best([refits.filtered(x, noise) for x in (start, plain)])
+
+        return self._saved(f"{piece_name(effects)}, instead", loop, better)
+
+    def _saved(self, name: str, loop: ClosedLoop, work: Callable[[], Fit]) -> Fit:
+        """A fit under a name that contains the released values of its loop.
+
+        **Arguments:**
+
+        - `loop`: the loop before the fit.
+        """
+        late = getattr(loop.controller, "delay", 0.0)
+        parts = [*(f"{x} free" for x in sorted(released_names(loop)))]
+        parts += [f"delay {late:.9g}"] if late else []
+        return self._campaign.piece(", ".join([f"{self._prefix}{name}", *parts]), work)
+
+
+def released_names(loop: ClosedLoop) -> set[str]:
+    """Names of free parameters that are held by declaration."""
+    return {p.name for p in loop.free_parameters if not p.declaration.free}
+
+
+def _exchanged(
+    loop: ClosedLoop, had: Sequence[AbstractEffect], effects: Sequence[AbstractEffect]
+) -> ClosedLoop:
+    kept = [e for e in loop.effects if not any(e is x for x in had)]
+    return loop.with_effects((*kept, *effects))

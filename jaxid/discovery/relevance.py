@@ -1,0 +1,59 @@
+"""Which changes of a joint's torque are relevant."""
+
+import numpy as np
+from jaxtyping import Float
+
+from ..simulation.dynamics import imposed
+from .diagnosis import over_recordings
+from .explore import Candidate
+from .models import Model
+
+# Smallest relevant effect if the law is unknown, as a share of the residual: filters on motion and
+# torque, ticks and stiction cause errors of this size even in good recordings.
+_BLURRED = 0.25
+
+
+def matters(at: Model, c: Candidate, plain: Candidate, worth: float) -> bool:
+    """Whether a set changes a joint's residual by more than the smallest relevant change.
+
+    **Arguments:**
+
+    - `at`: the fitted model. `c`: the set in addition to it. `plain`: the empty set.
+    - `worth`: smallest relevant change of a joint's torque, %.
+    """
+    assert at.fit is not None
+    if at.fit.error_percent.to_numpy().max() < 1e-3:
+        # Recordings without noise: the residual is the error of the integration.
+        return False
+    # Relative to the residual of the fit, whose relative error is known.
+    left = np.linalg.norm(np.concatenate(at.fit.residuals), axis=0)
+    changed = np.linalg.norm((c.rest - plain.rest).reshape(-1, c.rest.shape[-1]), axis=0)
+    percent = over_recordings(at.fit.error_percent.to_numpy())
+    return bool(np.any(changed * percent > _least(at, percent, worth) * left))
+
+
+def loses(less: Model, at: Model, worth: float) -> bool:
+    """Whether a smaller model raises a joint's error by a relevant amount.
+
+    **Arguments:**
+
+    - `worth`: smallest relevant change of a joint's torque, %.
+    """
+    assert less.left is not None
+    assert at.left is not None
+    lost = np.sqrt(np.maximum(less.left**2 - at.left**2, 0.0))
+    return bool(np.any(lost > _least(at, at.left, worth)))
+
+
+def _least(
+    at: Model, percent: Float[np.ndarray, " joints"], worth: float
+) -> Float[np.ndarray, " joints"]:
+    """Smallest relevant change of each joint's torque, %.
+
+    **Arguments:**
+
+    - `percent`: relative error of each joint's torque, %.
+    """
+    assert at.fit is not None
+    share = _BLURRED if imposed(at.fit.loop) else 0.0
+    return np.maximum(worth, share * percent)
