@@ -158,6 +158,25 @@ def test_superfluous_effect_is_taken_out_and_a_needed_one_stays(offset_case, off
 
 
 @pytest.mark.xdist_group("offset")
+def test_a_close_rival_that_was_only_predicted_is_fitted(offset_case, offset_story):
+    """A weak spring in the place of the offset; the prediction puts the offset slightly behind."""
+    search, start = search_of(offset_case), offset_story[0].steps[0]
+    search._visit((), start.fit)
+    last = with_chain(offset_case, start, Spring(joint=2, stiffness=0.01))[-1].fit
+    at = search._visit(search._added(last), last)
+    offset = (TorqueOffset(joint=2, level=0.01),)
+    search.visited.add(Model(offset, at.score + 20.0, noise=at.noise, beyond=1))
+    assert search._replaced(at) is None
+    search.visited.add(Model(offset, at.score + 5.0, noise=at.noise, beyond=1))
+    found = search._replaced(at)
+    assert found is not None
+    assert found.names == (("torque_offset", 2),)
+    assert found.score < at.score - 5
+    # It was fitted, so it is not tried again.
+    assert search._replaced(found) is None
+
+
+@pytest.mark.xdist_group("offset")
 def test_what_is_not_worth_knowing_is_not_added(offset_case, offset_story):
     fit, held_out = recordings_of(offset_case)
     found = jaxid.discover(jaxid.scara(), fit, held_out, worth=50.0, progress=False)
