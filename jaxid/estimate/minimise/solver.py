@@ -20,8 +20,9 @@ STEPS_JUDGED = 5
 # Damping above which a step is shorter than rounding.
 LARGEST_DAMPING = 1e12
 # A refused step with more than this damping could not have lowered the loss noticeably. If a full
-# step is also shorter than this many standard deviations, jumps of the loss hide the minimum.
-LARGE_DAMPING, NEAR = 1e4, 1.0
+# step is also shorter than the typical error of the estimate, which is the square root of the number
+# of estimated values in standard deviations, jumps of the loss hide the minimum.
+LARGE_DAMPING = 1e4
 
 
 class SolverState(eqx.Module):
@@ -65,7 +66,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     - `rtol`, `atol`, `norm`: required by optimistix; they are not used.
 
     A sampled law with quantised encoders makes the loss jump by small amounts. There it also stops
-    if damped steps are refused and a full step is shorter than one standard deviation.
+    if damped steps are refused and a full step is shorter than the typical error of the estimate.
     """
 
     descent: BoundedDescent
@@ -120,7 +121,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         decrease, variance = 2 * promised(full, f_info), losses[-1] / rows
         settled = decrease <= self.tolerance**2 * variance
         flat = losses[0] - losses[-1] < self.worth * losses[-1]
-        hidden = ~accepted & (search.damping > LARGE_DAMPING) & (decrease <= NEAR**2 * variance)
+        # Dummy unknowns and values at a bound do not move.
+        count = sum(jnp.count_nonzero(x) for x in full)
+        hidden = ~accepted & (search.damping > LARGE_DAMPING) & (decrease <= count * variance)
         stuck = search.damping > LARGEST_DAMPING
         state = SolverState(
             y_eval=jax.tree.map(jnp.add, y, diff),
