@@ -20,8 +20,8 @@ STEPS_JUDGED = 5
 # Damping above which a step is shorter than rounding.
 LARGEST_DAMPING = 1e12
 # A refused step with more than this damping could not have lowered the loss noticeably. If a full
-# step is also shorter than the typical error of the estimate, which is the square root of the number
-# of estimated values in standard deviations, jumps of the loss hide the minimum.
+# step is also shorter than the typical error of the estimate (the square root of the number of
+# estimated values, in standard deviations), jumps of the loss hide the minimum.
 LARGE_DAMPING = 1e4
 
 
