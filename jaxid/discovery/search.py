@@ -22,7 +22,7 @@ from .explore import DECISIVE, Candidate, explore, key_of
 from .fits import Fits, released_names
 from .landscape import Landscape, form, forms_of
 from .likelihood import price, score_of
-from .models import Model, Named, Visited, listed
+from .models import LIKELY, Model, Named, Visited, listed
 from .predict import Predictor
 from .ranking import Screened, judge
 from .release import released
@@ -212,7 +212,7 @@ class Search:
         # Effects that explain much less than one curve only approximate the curve.
         alone = [c.score for c in candidates if c.curve is not None and not c.effects]
         gain = nothing - min(alone, default=np.inf)
-        limit = at.score - max(gain - max(DECISIVE, _INEXACT * gain), 0.0)
+        limit = at.score - max(gain - max(DECISIVE, _INEXACT * gain), LIKELY)
         found = [(m, c) for c in tried if (m := self._fitted(at, c, nothing - c.score)) is not None]
         better = [pair for pair in found if pair[0].score < limit]
         best = min(better, key=lambda pair: pair[0].score, default=None)
@@ -284,8 +284,8 @@ class Search:
     def _without_one(self, at: Model) -> Model | None:
         """The model without one of its effects; None if all are needed.
 
-        An effect is removed if that lowers the score, or if its change of the torque is below the
-        smallest relevant change.
+        An effect is removed if the score is not higher by odds of 20 to 1 without it, or if its
+        change of the torque is below the smallest relevant change.
         """
         if not at.effects:
             return None
@@ -297,7 +297,7 @@ class Search:
             less = tuple(e for e in at.effects if e is not gone)
             found.append(self.had(at, less) or self.refitted(at, less))
         best = min(found, key=lambda m: m.score, default=at)
-        if best.score < at.score:
+        if best is not at and best.score < at.score + LIKELY:
             return best
         small = [m for m in found if not loses(m, at, self.asked.worth)]
         best = min(small, key=lambda m: m.score, default=None)
