@@ -65,32 +65,44 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
         "strength": case.strength,
         "floor": floor.tolist(),
         "story": {**story, **took},
-        "marks": judge(case, wanted.kind, story, floor),
+        "marks": judge(case, wanted.kind, story, floor, wanted.law),
     }
 
 
-def judge(case: Case, kind: str, story: dict[str, Any], floor: np.ndarray) -> dict[str, Any]:
+# Effects of a drive that a sampled law has if it is taken for continuous.
+DELAYS = "actuator_lag", "time_delay"
+
+
+def judge(
+    case: Case, kind: str, story: dict[str, Any], floor: np.ndarray, law: str
+) -> dict[str, Any]:
     """The marks of a story.
 
-    An effect is named if it was added, or shares the weight with an added one.
+    An effect is named if it was added, or shares the weight with an added one. If the law is taken
+    for continuous, a delay of a drive is that of the sampled law, and no further effect.
     """
+    added = story["added"]
+    if law == "continuous":
+        added = [a for a in added if a["effect"] not in DELAYS]
     groups = [
         [(a["effect"], a["joint"])] + [(i["effect"], i["joint"]) for i in a["indistinguishable"]]
-        for a in story["added"]
+        for a in added
     ]
     true = [(e.name, e.joint + 1) for e in case.hidden]
     after = np.array(story["error_percent"]["after"]["validate"])
     ratio = float((after / floor).max())
     sure = story["verdict"] in ("adequate", "explained")
     marks: dict[str, Any] = {"verdict": story["verdict"], "ratio": ratio, "sure": sure}
+    if law == "continuous":
+        marks["sampling_named"] = len(added) < len(story["added"])
     if kind == "clean":
-        return {**marks, "right": story["verdict"] == "adequate", "alarm": bool(groups)}
+        return {**marks, "right": sure and not groups, "alarm": bool(groups)}
     if kind == "outside":
         return {**marks, "right": not sure, "recognised": story["verdict"] == "outside_catalogue"}
     marks |= names_right(groups, true)
     marks["wrong_and_sure"] = sum(
         not any(t in group for t in true) and (a["probability"] or 0) > 0.9
-        for a, group in zip(story["added"], groups, strict=True)
+        for a, group in zip(added, groups, strict=True)
     )
     return {**marks, "right": all(marks["named"])}
 

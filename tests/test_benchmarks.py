@@ -129,16 +129,27 @@ def test_worlds_are_simulated_by_mujoco_and_judged(tmp_path):
 
 def _story(weights: dict[str, float]) -> dict[str, Any]:
     models = [
-        {"effects": [{"effect": n, "joint": 1} for n in names.split()], "weight": w}
+        {
+            "effects": [{"effect": n, "joint": 1} for n in names.split()],
+            "weight": w,
+            "difference": -2 * np.log(w),
+            "curve": None,
+        }
         for names, w in weights.items()
     ]
+    # A curve shares the weight, but contradicts no effect.
+    models.append({**models[-1], "effects": [], "curve": "curve"})
     return {"verdict": "explained", "added": [], "cpu": 1.0, "models": models, "ranking": [1]}
 
 
 def test_result_file_says_where_its_cases_come_from(tmp_path):
     from benchmarks import _world_results as results
 
-    record = {"run": results.origin(7), "number": 0, "story": _story({"a": 0.6, "a b": 0.3})}
+    record = {
+        "run": results.origin(7),
+        "number": 0,
+        "story": _story({"a": 0.6, "a b": 0.3, "": 0.1}),
+    }
     assert record["run"]["seed"] == 7
     path = tmp_path / "r.jsonl"
     with path.open("w") as file:

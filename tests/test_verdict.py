@@ -128,13 +128,16 @@ def test_torque_and_motion_apart_in_time_are_named_with_the_delay(found):
     assert delay == pytest.approx(late, rel=0.1)
 
 
-def test_a_drive_that_is_late_by_half_a_samplelooks_sampled(found):
+def test_a_drive_that_is_late_by_half_a_sample_looks_sampled(found):
     fit = found.fit
     half = fit.recordings.common_period() / 2
     late = fit.loop.add(TimeDelay(joint=2, delay=jnp.asarray(half)))
     (said,) = looks_sampled(dataclasses.replace(fit, loop=late))
     assert f"Sampled(law, every={2 * half:.4g})" in said
     assert "joint 2" in said
+    fast = fit.loop.add(TimeDelay(joint=2, delay=jnp.asarray(half / 4)))
+    (said,) = looks_sampled(dataclasses.replace(fit, loop=fast))
+    assert f"sampled every {5e2 * half:.2g} ms" in said
     later = fit.loop.add(TimeDelay(joint=2, delay=jnp.asarray(8 * half)))
     assert looks_sampled(dataclasses.replace(fit, loop=later)) == []
     ticking = dataclasses.replace(late, controller=Sampled(late.controller, every=2 * half))

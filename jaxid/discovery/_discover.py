@@ -104,6 +104,7 @@ def discover(
         slower = worst_at_standstill(story.fit)
         if slower is None:
             return story
+        say("the same without standstill, which the model describes worst")
         moving = dataclasses.replace(loop, standstill=slower)
         search = Search(asked, campaign, say, live_figure(progress), prefix="moving, ")
         try:

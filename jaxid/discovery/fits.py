@@ -87,7 +87,7 @@ class Fits:
         - `had`: effects of the loop over the starting model. `effects`: those that are kept.
         """
         return self._saved(
-            piece_name(effects),
+            f"{piece_name(effects)}, alone",
             loop,
             lambda: self._refits.filtered(_exchanged(loop, had, effects), noise),
         )

@@ -50,8 +50,9 @@ def _estimated(fit: Fit, given: ClosedLoop) -> list[str]:
     return found
 
 
-# Range of delays, in samples, of a law that is computed at the rate of the recording and held.
-_HELD = 0.25, 0.8
+# Range of delays, in samples, of a law that is computed at the rate of the recording and held, and
+# the smallest one of a faster law.
+_HELD, _FASTER = (0.25, 0.8), 0.05
 
 
 def looks_sampled(fit: Fit) -> list[str]:
@@ -62,11 +63,18 @@ def looks_sampled(fit: Fit) -> list[str]:
     for effect in fit.loop.effects:
         late = {ActuatorLag: "time_constant", TimeDelay: "delay"}.get(type(effect))
         value = 0.0 if late is None else float(getattr(effect, late))
+        joint = getattr(effect, "joint", "")
         if _HELD[0] * period < value < _HELD[1] * period:
             found.append(
-                f"joint {getattr(effect, 'joint', '')} has a delay of {1e3 * value:.3g} ms, about "
+                f"joint {joint} has a delay of {1e3 * value:.3g} ms, about "
                 "half a sample, like a law that is sampled with the recordings and held: declare "
                 f"it by jaxid.control.Sampled(law, every={period:.4g}), or, if the law is unknown, "
                 f"by jaxid.control.Tracking(delay={period / 2:.4g})"
+            )
+        elif _FASTER * period < value < _HELD[0] * period and not fit.loop.controller.imposes:
+            found.append(
+                f"joint {joint} has a delay of {1e3 * value:.3g} ms, like a law that is sampled "
+                f"every {2e3 * value:.2g} ms and held: if it is sampled, declare it by "
+                "jaxid.control.Sampled(law, every=...)"
             )
     return found
