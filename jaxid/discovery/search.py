@@ -268,7 +268,7 @@ class Search:
             # The candidate cannot be simulated at the predicted values.
             self.failures = (*self.failures, f"no fit with {listed(asked.effects)}: {error}")
             return None
-        if not fit.status.simulated or not is_there(fit, before):
+        if not fit.status.simulated or not is_there(fit, len(asked.effects)):
             return None
         return self._visit(self._added(fit), fit)
 

@@ -157,23 +157,35 @@ def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
     - `price`: price of the choice of effects in the score.
     """
     place = next(k for k, e in enumerate(fit.loop.effects) if e is effect)
-    at, own, count = 0, [], 0
-    for p in fit.loop.free_parameters:
-        if p.place[0] == "effects" and int(p.place[1]) == place:
-            count += p.size
-            own += range(at, at + p.size) if p.declaration.linear else []
-        at += p.size
+    values_of = _values_of(fit.loop, place)
+    own = [k for k, linear in values_of if linear]
     covariance = fit.covariance[np.ix_(own, own)]
     if effect.finite or not own or not np.isfinite(covariance).all():
         return False
     values = fit.theta[own]
     # The increase of the squared error without the effect (Wald), and the decrease of the price.
     lost = float(values @ np.linalg.pinv(covariance) @ values)
-    saved = count * np.log(sum(r.size for r in fit.residuals)) + price
+    saved = len(values_of) * np.log(sum(r.size for r in fit.residuals)) + price
     return bool(lost > _CERTAIN * saved)
 
 
-def is_there(found: Fit, before: Fit) -> bool:
-    """Whether the recordings determine a value of the effects that a refit has added."""
-    new = [k for k, name in enumerate(found.names) if name not in before.names]
-    return not new or bool(np.isfinite(found.std[new]).any())
+def is_there(found: Fit, added: int) -> bool:
+    """Whether the recordings determine a value of each effect that a refit has added.
+
+    **Arguments:**
+
+    - `added`: number of added effects; these are the loop's last ones.
+    """
+    count = len(found.loop.effects)
+    each = [_values_of(found.loop, place) for place in range(count - added, count)]
+    return all(not own or np.isfinite(found.std[[k for k, _ in own]]).any() for own in each)
+
+
+def _values_of(loop: ClosedLoop, place: int) -> list[tuple[int, bool]]:
+    """The places of an effect's values in `theta`, each with whether torque is linear in it."""
+    at, own = 0, []
+    for p in loop.free_parameters:
+        if p.place[0] == "effects" and int(p.place[1]) == place:
+            own += [(k, p.declaration.linear) for k in range(at, at + p.size)]
+        at += p.size
+    return own
