@@ -18,7 +18,7 @@ from jaxid.discovery.likelihood import price, score, weights
 from jaxid.discovery.models import Model, Visited, probability
 from jaxid.discovery.score import Data
 from jaxid.discovery.search import Search
-from jaxid.discovery.verify import is_there, of_one_sign
+from jaxid.discovery.verify import of_one_sign, undetermined
 from jaxid.effects import (
     Backlash,
     JointElasticity,
@@ -180,12 +180,11 @@ def test_a_close_rival_that_was_only_predicted_is_fitted(offset_case, offset_sto
 def test_every_added_effect_must_be_determined(offset_case, offset_story):
     start = offset_story[0].steps[0]
     fit = with_chain(offset_case, start, TorqueOffset(joint=2), QuadraticDrag(joint=1))[-1].fit
-    assert is_there(fit, 2)
+    assert undetermined(fit, 2) == ()
     covariance = fit.covariance.copy()
     covariance[-1, -1] = np.inf
     loose = dataclasses.replace(fit, covariance=covariance)
-    assert not is_there(loose, 2)
-    assert not is_there(loose, 1)
+    assert undetermined(loose, 2) == undetermined(loose, 1) == fit.loop.effects[-1:]
 
 
 @pytest.mark.xdist_group("offset")

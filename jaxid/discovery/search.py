@@ -31,7 +31,7 @@ from .screening import carried, screen
 from .support import unsupported
 from .system import System
 from .verdict import Outcome
-from .verify import Refits, is_there, needed
+from .verify import Refits, needed, undetermined
 from .watched import ROUND, Watched
 
 # Largest number of sets that are refitted in one round, and the relative error of predicted
@@ -254,23 +254,26 @@ class Search:
         return not lacking
 
     def _fitted(self, at: Model, asked: Candidate, promised: float) -> Model | None:
-        """A full refit with additional effects; None if it fails or does not determine them."""
+        """A full refit with those additional effects that it determines; None if it fails."""
         assert at.fit is not None
-        before: Fit = at.fit
-        together = (*at.effects, *asked.effects)
-        had = self.had(at, together)
-        if had is not None:
+        if (had := self.had(at, (*at.effects, *asked.effects))) is not None:
             return had
         self.watched.begin("fit", f"fit with {listed(asked.effects)}", ROUND)
         try:
-            fit = self.fits.with_effects(before, at.effects, asked.effects, asked.noise, promised)
+            fit = self.fits.with_effects(at.fit, at.effects, asked.effects, asked.noise, promised)
         except (ModelError, FitError) as error:
             # The candidate cannot be simulated at the predicted values.
             self.failures = (*self.failures, f"no fit with {listed(asked.effects)}: {error}")
             return None
-        if not fit.status.simulated or not is_there(fit, len(asked.effects)):
+        if not fit.status.simulated:
             return None
-        return self._visit(self._added(fit), fit)
+        added, loose = self._added(fit), undetermined(fit, len(asked.effects))
+        if not loose:
+            return self._visit(added, fit)
+        kept = tuple(e for e in added if not any(e is x for x in loose))
+        if len(kept) == len(at.effects):
+            return None
+        return self.had(at, kept) or self.refitted(self._judged(added, fit), kept)
 
     def had(self, at: Model, effects: Sequence[AbstractEffect]) -> Model | None:
         """An earlier refit of a set with the same held values released; None if there is none."""

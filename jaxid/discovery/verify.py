@@ -169,16 +169,19 @@ def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
     return bool(lost > _CERTAIN * saved)
 
 
-def is_there(found: Fit, added: int) -> bool:
-    """Whether the recordings determine a value of each effect that a refit has added.
+def undetermined(found: Fit, added: int) -> tuple[AbstractEffect, ...]:
+    """The effects, of those that a refit has added, of which the recordings determine no value.
 
     **Arguments:**
 
     - `added`: number of added effects; these are the loop's last ones.
     """
-    count = len(found.loop.effects)
-    each = [_values_of(found.loop, place) for place in range(count - added, count)]
-    return all(not own or np.isfinite(found.std[[k for k, _ in own]]).any() for own in each)
+    effects = found.loop.effects
+    last = range(len(effects) - added, len(effects))
+    values = {k: [place for place, _ in _values_of(found.loop, k)] for k in last}
+    return tuple(
+        effects[k] for k, own in values.items() if own and not np.isfinite(found.std[own]).any()
+    )
 
 
 def _values_of(loop: ClosedLoop, place: int) -> list[tuple[int, bool]]:
