@@ -73,45 +73,32 @@ class Fits:
             lambda: self._refits.with_effects(before, more, noise, promised),
         )
 
-    def alone(
+    def exchanged(
         self,
         loop: ClosedLoop,
         had: Sequence[AbstractEffect],
         effects: Sequence[AbstractEffect],
         noise: Sequence[ARFilter],
     ) -> Fit:
-        """The fit of a model with only some of its effects.
+        """The fit of a model with other effects, from their current values.
 
-        **Arguments:**
-
-        - `had`: effects of the loop over the starting model. `effects`: those that are kept.
-        """
-        return self._saved(
-            f"{piece_name(effects)}, alone",
-            loop,
-            lambda: self._refits.filtered(_exchanged(loop, had, effects), noise),
-        )
-
-    def instead(
-        self,
-        loop: ClosedLoop,
-        had: Sequence[AbstractEffect],
-        effects: Sequence[AbstractEffect],
-        noise: Sequence[ARFilter],
-    ) -> Fit:
-        """The better one of two fits with other effects, of which one starts without filters.
+        If some of the effects are new, the better one of two fits, of which one starts from a fit
+        without filters.
 
         **Arguments:**
 
         - `had`: effects of the loop over the starting model. `effects`: those in their place.
         """
-        start, refits = _exchanged(loop, had, effects), self._refits
+        kept = [e for e in loop.effects if not any(e is x for x in had)]
+        start, refits = loop.with_effects((*kept, *effects)), self._refits
+        new = not all(any(e is x for x in had) for e in effects)
 
         def better() -> Fit:
-            plain = refits.unfiltered(start, noise).loop
-            return refits.best([refits.filtered(x, noise) for x in (start, plain)])
+            plain = [refits.unfiltered(start, noise).loop] if new else []
+            return refits.best([refits.filtered(x, noise) for x in (start, *plain)])
 
-        return self._saved(f"{piece_name(effects)}, instead", loop, better)
+        name = f"{piece_name(effects)}, {'instead' if new else 'alone'}"
+        return self._saved(name, loop, better)
 
     def _saved(self, name: str, loop: ClosedLoop, work: Callable[[], Fit]) -> Fit:
         """A fit under a name that contains the released values of its loop.
@@ -129,10 +116,3 @@ class Fits:
 def released_names(loop: ClosedLoop) -> set[str]:
     """Names of free parameters that are held by declaration."""
     return {p.name for p in loop.free_parameters if not p.declaration.free}
-
-
-def _exchanged(
-    loop: ClosedLoop, had: Sequence[AbstractEffect], effects: Sequence[AbstractEffect]
-) -> ClosedLoop:
-    kept = [e for e in loop.effects if not any(e is x for x in had)]
-    return loop.with_effects((*kept, *effects))

@@ -313,7 +313,7 @@ class Search:
         """A fitted model with only some of its effects, fitted again from their current values."""
         assert at.fit is not None
         self.watched.begin("fit", f"fit with {listed(effects) or 'nothing'} alone")
-        fit = self.fits.alone(at.fit.loop, at.effects, effects, at.noise)
+        fit = self.fits.exchanged(at.fit.loop, at.effects, effects, at.noise)
         return self._visit(self._added(fit), fit)
 
     def _replaced(self, at: Model) -> Model | None:
@@ -335,7 +335,7 @@ class Search:
         for rival in rivals[:_RIVALS]:
             self.watched.begin("fit", f"fit with {listed(rival.effects)} instead", ROUND)
             try:
-                fit = self.fits.instead(at.fit.loop, at.effects, rival.effects, rival.noise)
+                fit = self.fits.exchanged(at.fit.loop, at.effects, rival.effects, rival.noise)
             except (ModelError, FitError) as error:
                 self.failures = (*self.failures, f"no fit with {rival.label}: {error}")
                 continue

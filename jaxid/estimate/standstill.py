@@ -76,8 +76,7 @@ def worst_at_standstill(found: Fit) -> Standstill | None:
     if found.status is Status.misfit:
         return None
     usual = Standstill().settled(loop.joints, imposed=True)
-    motions = [_motion(r, _cutoff(found)) for r in found.recordings]
-    rest, slow, speed, _ = _slow(found, usual, motions)
+    rest, slow, speed, _ = _slow(found, usual, _motions(found))
     fast = (rest != 0) & ~slow & (np.abs(speed) > _LARGEST)
     counts = [np.sum(there, axis=0) for there in (slow, fast)]
     powers = [
@@ -120,7 +119,7 @@ def slow_note(given: Standstill, loop: ClosedLoop) -> list[str]:
 def _undescribed(found: Fit, proposed: Standstill) -> Bool[np.ndarray, " joints"]:
     """For which joints the samples that the settings leave out are worth leaving out."""
     batch = found.optimum.problem.batch
-    motions = [_motion(r, _cutoff(found)) for r in found.recordings]
+    motions = _motions(found)
     rest, left_out, speed, away = _slow(found, proposed, motions)
     fast = (rest != 0) & ~left_out & (np.abs(speed) > _LARGEST)
     enough = (left_out.sum(axis=0) >= _FEW) & (fast.sum(axis=0) >= _FEW)
@@ -152,13 +151,19 @@ def _slow(
 
     - `motions`: speed and distance along each recording.
     """
-    parts = []
+    parts, cutoff = [], _cutoff(found)
     for recording, at, rest, (speed, away) in zip(
         found.recordings, _compared_samples(found), found.residuals, motions, strict=True
     ):
-        gone = (rest != 0) & ~proposed.moving(recording, _cutoff(found))[at]
+        gone = (rest != 0) & ~proposed.moving(recording, cutoff)[at]
         parts.append((rest, gone, speed[at], away[at]))
     return tuple(np.concatenate(x) for x in zip(*parts, strict=True))
+
+
+def _motions(found: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Speed and distance along each recording, as of `_motion`."""
+    cutoff = _cutoff(found)
+    return [_motion(r, cutoff) for r in found.recordings]
 
 
 def _cutoff(found: Fit) -> float:
