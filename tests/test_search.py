@@ -4,13 +4,17 @@ import dataclasses
 from collections import Counter
 from types import SimpleNamespace
 
+import equinox as eqx
 import independent as sim
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 from independent import effects as fx
 from stories import recordings_of, search_of, with_chain
 
 import jaxid
+from jaxid.discovery.bounded import bounded_amplitudes
 from jaxid.discovery.explore import Candidate, _fitted, _plain, key_of
 from jaxid.discovery.hypotheses import Hypothesis
 from jaxid.discovery.landscape import Entry, shares_a_joint
@@ -20,15 +24,46 @@ from jaxid.discovery.score import Data
 from jaxid.discovery.search import Search
 from jaxid.discovery.verify import of_one_sign, undetermined
 from jaxid.effects import (
+    AbstractEffect,
     Backlash,
     JointElasticity,
+    Motion,
     QuadraticDrag,
     RotorInertia,
     Spring,
     Stribeck,
     TorqueOffset,
     TorqueRipple,
+    on_joint,
 )
+from jaxid.parameters import Scalar, parameter
+
+
+class OffsetAndDrag(AbstractEffect):
+    """A constant torque, and a drag that is not in the data, both of one sign only."""
+
+    joint_fields = ("joint",)
+    joint: int = eqx.field(static=True)
+    level: Scalar = parameter(0.0, symbol="l", unit="N·m", lower=0.0, scale=0.1)
+    drag: Scalar = parameter(0.0, symbol="d", unit="N·m·s²/rad²", lower=0.0, scale=0.1)
+    way: float = eqx.field(static=True, default=1.0)
+
+    @classmethod
+    def screened(cls, scene):
+        return [cls(joint=j) for j in (1, 2)]
+
+    def torque(self, motion: Motion):
+        v = motion.v[self.joint - 1]
+        return on_joint(self.joint, self.level + self.drag * self.way * v * jnp.abs(v), motion)
+
+
+class OffsetAndThrust(OffsetAndDrag):
+    """The same with the other sign of the drag."""
+
+    @classmethod
+    def screened(cls, scene):
+        return [cls(joint=j, way=-1.0) for j in (1, 2)]
+
 
 # --- the score ------------------------------------------------------------------------------------
 
@@ -185,6 +220,36 @@ def test_every_added_effect_must_be_determined(offset_case, offset_story):
     covariance[-1, -1] = np.inf
     loose = dataclasses.replace(fit, covariance=covariance)
     assert undetermined(loose, 2) == undetermined(loose, 1) == fit.loop.effects[-1:]
+
+
+@pytest.mark.xdist_group("offset")
+def test_an_amplitude_at_its_bound_does_not_exclude_an_effect(offset_case):
+    """Noise makes one of the two drags negative."""
+    fit, held_out = recordings_of(offset_case)
+    bound = []
+    for effect in (OffsetAndDrag, OffsetAndThrust):
+        found = jaxid.discover(
+            jaxid.scara(), fit, held_out, catalogue=[effect], most=1, progress=False
+        )
+        assert [(a.effect_name(), a.joint) for a in found.loop.effects[-1:]] == [
+            (effect.effect_name(), 2)
+        ]
+        bound.append(float(found.loop.effects[-1].drag) < 1e-6)
+    assert sorted(bound) == [False, True]
+
+
+def test_amplitudes_within_bounds_are_those_of_scipy():
+    rng = np.random.default_rng(8)
+    columns, left = rng.standard_normal((2, 40, 3))[0], rng.standard_normal(40)
+    columns[:, 2] -= left
+    gram, score_ = columns.T @ columns, columns.T @ left
+    found, explained = bounded_amplitudes(gram, score_, (np.zeros(3), np.full(3, np.inf)))
+    expected, rest = scipy.optimize.nnls(columns, left)
+    assert 0.0 in expected
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+    assert explained == pytest.approx(left @ left - rest**2)
+    away = bounded_amplitudes(gram, -score_ * [0, 0, 0], (np.zeros(3), np.full(3, np.inf)))
+    assert away[1] == 0.0
 
 
 @pytest.mark.xdist_group("offset")

@@ -27,7 +27,7 @@ from .search import Search
 from .step import Step
 from .story import Discovery
 from .text import joined
-from .verdict import Outcome, misfit_of, refuted, risen, undecided
+from .verdict import Outcome, explains_little, misfit_of, refuted, risen, undecided
 
 _STOPPED = "the search was interrupted; resume=... continues it from its saved steps"
 # Smallest weight of a model whose error on held-out recordings is computed.
@@ -99,7 +99,7 @@ def discover(
     ):
         search = Search(asked, campaign, say, live_figure(progress))
         story = _searched(search, loop, started)
-        if story.verdict != "undetermined" or story.interrupted:
+        if story.verdict != "undetermined" or story.interrupted or story.fit.mistake:
             return story
         slower = worst_at_standstill(story.fit)
         if slower is None:
@@ -155,10 +155,17 @@ def _told(
 def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step], models: Sequence[Model]) -> str:
     """Why the verdict is undetermined; empty if it is not."""
     first, last = steps[0], steps[-1]
+    if first.fit.mistake:
+        return f"{first.fit.mistake}; no effect was searched, so correct this first"
     if verdict == "outside_catalogue":
         # A curve can absorb the residual of a model that explains almost nothing.
         blind = last.fit.status is Status.misfit and last.fit.error_percent.min(axis=None) > 99
-        return misfit_of(last.fit) if blind else ""
+        if blind:
+            return misfit_of(last.fit)
+        # So can added effects.
+        assert last.diagnosis is not None
+        measured = last.diagnosis.measured
+        return explains_little(last.fit, search.at.noise, measured) if last is not first else ""
     both = None
     if first.held_out is not None and last.held_out is not None:
         both = first.held_out, last.held_out

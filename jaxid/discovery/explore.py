@@ -11,9 +11,10 @@ from jaxtyping import Float
 from ..effects import AbstractEffect, Curve
 from ..noise import ARFilter
 from ..simulation.loop import ClosedLoop
+from .bounded import least_squares
 from .landscape import Entry, Landscape, form, shares_a_joint
 from .likelihood import score
-from .predict import Prediction, least_squares
+from .predict import Prediction
 from .score import spanned
 
 # Decisive difference of scores: odds of 150 to 1.

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from ..effects import AbstractEffect, AbstractTransmission, Curve
 from ..noise import ARFilter
 from ..parameters import write_values
+from .bounded import bounded_amplitudes
 from .hypotheses import Hypothesis, amplitudes
 from .predict import Prediction, Predictor
 from .score import Data, Gram, Whitened, by_width, explained_by, spanned, strong_directions
@@ -90,34 +91,45 @@ class Landscape(eqx.Module):
         x, single = self.white.signatures, self.white.signatures.dtype
         score = (residual.astype(single) @ x).astype(float)
         across = (taken.astype(single).T @ x).astype(float)
-        evidence = np.full(len(self.hypotheses), -np.inf)
+        explained, price = np.zeros((2, len(self.hypotheses)))
         inner: dict[int, np.ndarray] = {}
         for places, columns in by_width([h.columns for h in self.hypotheses]):
             part = across[:, columns]
             gram = self.gram.gram[columns[:, :, None], columns[:, None, :]]
             gram = gram - np.einsum("kbi,kbj->bij", part, part)
             value, freedom = explained_by(gram, score[columns][..., None])
-            price = freedom * np.log(self.gram.count)
-            evidence[places] = np.where(freedom > 0, value[:, 0] - price, -np.inf)
+            explained[places] = value[:, 0]
+            price[places] = np.where(freedom > 0, freedom * np.log(self.gram.count), np.inf)
             inner |= dict(zip(places.tolist(), gram, strict=True))
-        evidence -= 2 * np.log([h.tests for h in self.hypotheses])
+        price += 2 * np.log([h.tests for h in self.hypotheses])
         found: dict[tuple, Entry] = {}
-        for place in np.argsort(-evidence).tolist():
+        for place in np.argsort(price - explained).tolist():
             hypothesis = self.hypotheses[place]
-            if isinstance(hypothesis.effect, Curve) != curves or not np.isfinite(evidence[place]):
+            if isinstance(hypothesis.effect, Curve) != curves or not np.isfinite(price[place]):
                 continue
             name = form(hypothesis.effect)
-            if name in found:
+            if name not in found and len(found) == most:
                 continue
-            at = list(hypothesis.columns)
-            amplitude = np.linalg.pinv(inner[place], rcond=1e-9) @ score[at] / self.gram.size[at]
-            low, high = np.array(hypothesis.lower), np.array(hypothesis.upper)
-            if np.all((amplitude > low) & (amplitude < high)):
-                effect = _sized(hypothesis.effect, amplitude)
-                found[name] = Entry(hypothesis, float(evidence[place]), effect)
-            if len(found) == most:
-                break
-        return list(found.values())
+            # Bounds of the amplitudes only reduce the evidence.
+            least = found[name].evidence if name in found else -np.inf
+            if explained[place] - price[place] > least:
+                own = score[list(hypothesis.columns)]
+                entry = self._entry(hypothesis, inner[place], own, float(price[place]))
+                if entry is not None and entry.evidence > least:
+                    found[name] = entry
+        return sorted(found.values(), key=lambda e: -e.evidence)
+
+    def _entry(
+        self, hypothesis: Hypothesis, gram: np.ndarray, score: np.ndarray, price: float
+    ) -> Entry | None:
+        """A hypothesis with amplitudes inside their bounds; None if all of them are at a bound."""
+        size = self.gram.size[list(hypothesis.columns)]
+        limits = np.array(hypothesis.lower) * size, np.array(hypothesis.upper) * size
+        amplitude, explained = bounded_amplitudes(gram, score, limits)
+        if not explained > 0.0:
+            return None
+        effect = _sized(hypothesis.effect, amplitude / size)
+        return Entry(hypothesis, float(explained - price), effect)
 
 
 def forms_of(hypotheses: Sequence[Hypothesis]) -> int:

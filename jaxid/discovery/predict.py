@@ -12,12 +12,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..effects import AbstractEffect
 from ..estimate.minimise import Filling, Stopping, Sums, descend
 from ..noise import ARFilter
 from ..parameters import Bounds, read_values, write_values
+from .bounded import least_squares
 from .finite import differences
 from .hypotheses import free_of
 from .linear import at_samples, respond
@@ -215,7 +216,13 @@ class Predictor(eqx.Module):
         free = [p for e in found.effects for p in free_of(e)]
         values, bounds = _values(found.effects), Bounds.of(free)
         amplitude = np.array([p.declaration.linear for p in free for _ in range(p.size)], bool)
-        held = (values <= np.asarray(bounds.lower)) | (values >= np.asarray(bounds.upper))
+        inside = (values > np.asarray(bounds.lower)) & (values < np.asarray(bounds.upper))
+        # The effect to which each value belongs.
+        owner = np.array(
+            [k for k, e in enumerate(found.effects) for p in free_of(e) for _ in range(p.size)], int
+        )
+        # An effect whose amplitudes are all at a bound has no torque, or too much of it.
+        sized = {*owner[amplitude]} <= {*owner[amplitude & inside]}
         return Prediction(
             effects=found.effects,
             rest=rest,
@@ -225,37 +232,8 @@ class Predictor(eqx.Module):
             taken=found.taken,
             loss=float(found.loss),
             freedom=self.basis.shape[1] + len(values),
-            possible=bool(there) and not bool(np.any(held & amplitude)),
+            possible=bool(there) and sized,
         )
-
-
-def least_squares(
-    left: Float[np.ndarray, " rows"],
-    columns: Float[np.ndarray, "rows columns"],
-    limits: tuple[Float[np.ndarray, " bounded"], Float[np.ndarray, " bounded"]],
-) -> tuple[Float[np.ndarray, " columns"], Bool[np.ndarray, " columns"]]:
-    """Coefficients of a bounded least-squares problem, and which of them are not at a bound.
-
-    **Arguments:**
-
-    - `left`: right-hand side. `columns`: matrix, with few rows (coordinates in a basis).
-    - `limits`: lower and upper bounds of the first columns; the others have none.
-    """
-    size = np.linalg.norm(columns, axis=0)
-    size[size == 0] = 1.0
-    scaled = columns / size
-    lower, upper = (np.full(len(size), x) for x in (-np.inf, np.inf))
-    lower[: len(limits[0])], upper[: len(limits[1])] = limits
-    taken = np.linalg.lstsq(scaled, left, rcond=1e-9)[0]
-    low, high = lower * size, upper * size
-    if np.all((taken >= low) & (taken <= high)):
-        return taken / size, np.ones(len(size), bool)
-    import scipy
-
-    # The solver needs an interval of positive length, also for a value that may not change.
-    room = 1e-9 * (1 + np.abs(taken).max())
-    found = scipy.optimize.lsq_linear(scaled, left, (low - room, high + room), method="bvls")
-    return np.clip(found.x, low, high) / size, found.active_mask == 0
 
 
 class _Reached(eqx.Module):

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from ..effects import Curve, Scene
 from ..errors import FitError
 from ..estimate import Fit
+from .bounded import bounded_amplitudes
 from .comparison import Comparison
 from .diagnosis import Diagnosis, Verdict, share_left
 from .floor import floor_of
@@ -138,26 +139,29 @@ def _order(verdict: Verdict) -> float:
 def _verdict(
     gram: Gram, hypothesis: Hypothesis, explained: float, freedom: int, tests: float
 ) -> Verdict:
+    within = _within_bounds(gram, hypothesis) if freedom > 0 else 0.0
+    explained = within or explained
     p = corrected(min(1.0, chance(explained, freedom) * hypothesis.tests), tests)
     price = freedom * np.log(gram.count) + 2 * np.log(hypothesis.tests)
-    possible = freedom > 0 and _within_bounds(gram, hypothesis)
     return Verdict(
         hypothesis=hypothesis,
         evidence=explained - float(price),
         explained=explained,
         freedom=freedom,
         p_value=p,
-        possible=possible,
+        possible=within > 0.0,
     )
 
 
-def _within_bounds(gram: Gram, hypothesis: Hypothesis) -> bool:
-    """Whether the predicted amplitudes are within their bounds (a negative drag is not)."""
-    values, _ = gram.amplitude(hypothesis.columns)
-    return all(
-        low < value < high
-        for value, low, high in zip(values, hypothesis.lower, hypothesis.upper, strict=True)
-    )
+def _within_bounds(gram: Gram, hypothesis: Hypothesis) -> float:
+    """What a hypothesis explains within its bounds; zero if all amplitudes are at a bound.
+
+    A negative drag, for example, is not possible.
+    """
+    at = list(hypothesis.columns)
+    size = gram.size[at]
+    limits = np.array(hypothesis.lower) * size, np.array(hypothesis.upper) * size
+    return bounded_amplitudes(gram.gram[np.ix_(at, at)], gram.score[at], limits)[1]
 
 
 def _floor(

@@ -25,6 +25,10 @@ def remarks(steps: Sequence[Step], given: ClosedLoop) -> tuple[str, ...]:
     return (*(said if bad else ()), *more)
 
 
+# Deviations between an estimate and the default value that it contradicts.
+_APART = 3.0
+
+
 def _estimated(fit: Fit, given: ClosedLoop) -> list[str]:
     """Notes on values with a default that the search estimated."""
     places = {p.place for p in given.free_parameters}
@@ -34,11 +38,16 @@ def _estimated(fit: Fit, given: ClosedLoop) -> list[str]:
         if p.place in held:
             before, row = float(held[p.place].where(given)), fit.table().loc[p.name]
             unit = "" if row["unit"] == "1" else f" {row['unit']}"
-            std = f" ± {row['std']:.2g}" if np.isfinite(row["std"]) else ""
-            unsure = "" if std else ", and do not determine it"
+            value, std = row["value"], row["std"]
+            said = f"{p.name} was estimated, {value:.3g}"
+            if not np.isfinite(std):
+                found.append(f"{said}{unit}, but these recordings do not determine it")
+                continue
+            far = abs(value - before) > _APART * std
             found.append(
-                f"{p.name} was estimated, {row['value']:.3g}{std}{unit}: these recordings "
-                f"contradict its default value of {before:.3g}{unsure}"
+                f"{said} ± {std:.2g}{unit}: these recordings "
+                + ("" if far else "do not ")
+                + f"contradict its default value of {before:.3g}"
             )
     before, after = (getattr(x.controller, "delay", 0.0) for x in (given, fit.loop))
     if after != before and fit.loop.controller.imposes:

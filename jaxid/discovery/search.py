@@ -82,6 +82,10 @@ class Search:
         """
         self.given = loop
         at = self._start(loop)
+        assert at.fit is not None
+        if at.fit.mistake:
+            self.at = at
+            return "undetermined", False
         while True:
             candidates, nothing = self._predicted(at)
             better = self._released(at, candidates, nothing)
@@ -115,6 +119,9 @@ class Search:
         self.watched.begin("fit", "fit of the starting model")
         first = self.fits.start(loop)
         screened, diagnosis = self._screened(first, ())
+        if first.mistake:
+            # Effects would only approximate the mistake.
+            return self._visit((), first)
         # If noise is strongly coloured, plain output error is imprecise. A filter that is estimated
         # from the residual itself would model a missing effect as noise, so that of the diagnosis
         # is used.

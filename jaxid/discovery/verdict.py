@@ -10,7 +10,6 @@ from ..estimate import Fit, Status
 from ..estimate.result import DOUBTFUL_PERCENT, joint_columns
 from ..noise import ARFilter
 from ..simulation.dynamics import imposed
-from .causes import likely_cause
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
 from .explore import DECISIVE
@@ -45,7 +44,7 @@ def misfit_of(fit: Fit) -> str:
 
 def _to_check(fit: Fit) -> str:
     """The mistake in the data that explains a misfit, or what to check."""
-    return likely_cause(fit.loop, fit.recordings) or (
+    return fit.mistake or (
         "check the units of each joint, signs, the order of the joints, time stamps and the "
         "control law"
     )
@@ -118,7 +117,7 @@ def refuted(
     if chosen.status is not Status.converged:
         return f"the fit of the model did not converge ({chosen.status.value})"
     reason = (
-        _explains_little(chosen, noise)
+        explains_little(chosen, noise, diagnosis.measured)
         or _apart_in_time(chosen, diagnosis, worth)
         or _above_floor(chosen, diagnosis, worth)
         or _above_measured(chosen, diagnosis.measured, worth)
@@ -133,11 +132,22 @@ def refuted(
     )
 
 
-def _explains_little(fit: Fit, noise: Sequence[ARFilter]) -> str:
-    """The reason if a third of a joint's torque is unexplained and not white noise."""
+def explains_little(fit: Fit, noise: Sequence[ARFilter], measured: Floor | None) -> str:
+    """The reason if a third of a joint's torque is unexplained and not noise.
+
+    **Arguments:**
+
+    - `noise`: noise filters of the residual, one per output. `measured`: noise floor without a
+      model.
+    """
     left = over_recordings(fit.error_percent.to_numpy())
-    for label, percent, filt in zip(joint_columns(fit.loop.joints), left, noise, strict=True):
-        if percent > DOUBTFUL_PERCENT and filt.gain > _COLOURED:
+    floor = np.zeros(len(left))
+    if measured is not None:
+        floor = np.nan_to_num(over_recordings(measured.high))
+    joints = joint_columns(fit.loop.joints)
+    for label, percent, by_noise, filt in zip(joints, left, floor, noise, strict=True):
+        large = percent > max(DOUBTFUL_PERCENT, _REFUTED * by_noise)
+        if large and filt.gain > _COLOURED:
             return (
                 f"the error of {label} is {percent:.3g} %, and its residual is not white noise: "
                 f"{_to_check(fit)}"

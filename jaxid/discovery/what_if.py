@@ -19,12 +19,13 @@ from ..estimate.oem import oem_of
 from ..noise import ARFilter
 from ..parameters import Bounds, read_values, write_values
 from ..recording import Recording, Recordings
+from .bounded import least_squares
 from .comparison import Comparison, compare
 from .diagnosis import over_recordings, share_left
 from .hypotheses import amplitudes, free_of
 from .landscape import form
 from .linear import at_rows
-from .predict import Prediction, Predictor, least_squares
+from .predict import Prediction, Predictor
 from .score import spanned, whitened
 from .screening import offered
 from .system import System

@@ -17,7 +17,8 @@ from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
 from ..simulation.batch import at_rest, check_joints, check_law
 from ..simulation.loop import ClosedLoop
-from .oem import OEM
+from .mistakes import LARGE_PERCENT, likely_mistake
+from .oem import OEM, oem_of
 from .result import DOUBTFUL_PERCENT, AbstractMethod, Fit, Status
 from .standstill import raised, slow_note
 
@@ -64,7 +65,7 @@ def fit(
         if not again.succeeded:
             break
         found = again
-    found = _followed(_doubted(_without_nan(found)))
+    found = _followed(_doubted(_examined(_without_nan(found), loop)))
     notes = (*found.notes, *_matter(found), *_band(loop, recordings))
     notes = (*notes, *slow_note(given, found.loop), *_gaps(recordings))
     notes = (*notes, *_restarted(loop, recordings))
@@ -170,6 +171,23 @@ def _without_nan(found: Fit) -> Fit:
     return dataclasses.replace(found, status=Status.overflowed, notes=(*found.notes, note))
 
 
+def _examined(found: Fit, loop: ClosedLoop) -> Fit:
+    """The fit with the likely mistake in its recordings, if it leaves much of a joint's torque.
+
+    A fit from given values continues another fit of the same recordings, which was examined.
+
+    **Arguments:**
+
+    - `loop`: the model at its start values, because an effect that fits a mistake may hide it.
+    """
+    largest = float((found.error_percent * _of_motion(found)).to_numpy().max())
+    if largest < LARGE_PERCENT or oem_of(found).start == "given":
+        return found
+    mistake = likely_mistake(loop, found.recordings)
+    notes = (mistake, *found.notes) if mistake else found.notes
+    return dataclasses.replace(found, mistake=mistake, notes=notes)
+
+
 def _doubted(found: Fit) -> Fit:
     """The fit, with a note if its relative error is larger than that of a good model.
 
@@ -184,10 +202,12 @@ def _doubted(found: Fit) -> Fit:
     if not worst:
         return found
     joints = ", ".join(f"{label} {value:.3g} %" for label, value in worst.items())
-    note = (
-        f"the model does not describe these recordings (relative error: {joints}): check units, "
-        "signs, the control law and its gains, and whether the motion is larger than the noise"
-    )
+    note = f"the model does not describe these recordings (relative error: {joints})"
+    if not found.mistake:
+        note += (
+            ": check units, signs, the control law and its gains, and whether the motion is larger "
+            "than the noise"
+        )
     return dataclasses.replace(found, notes=(*found.notes, note))
 
 

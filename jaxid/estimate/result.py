@@ -72,6 +72,8 @@ class Fit(AbstractShown):
       `(samples, joints)` for each recording.
     - `undetermined`: sentences that name combinations of parameters that the data do not determine.
     - `notes`: other remarks.
+    - `mistake`: likely mistake in the recordings, such as a wrong sign or unit, if the fit leaves a
+      tenth of a joint's torque and a regression finds one; otherwise empty.
     - `noise`: estimated or given noise filters, one for each output or one for all; None for white
       noise.
     - `rounds`: number of alternations between parameters and filters.
@@ -92,6 +94,7 @@ class Fit(AbstractShown):
     deviations: str = eqx.field(static=True, default="")
     undetermined: tuple[str, ...] = eqx.field(static=True, default=())
     notes: tuple[str, ...] = eqx.field(static=True, default=())
+    mistake: str = eqx.field(static=True, default="")
     noise: tuple[ARFilter, ...] | VectorAR | None = None
     rounds: int = eqx.field(static=True, default=0)
     optimum: Any = None
@@ -186,6 +189,7 @@ class Fit(AbstractShown):
             "deviations": self.deviations,
             "undetermined": list(self.undetermined),
             "notes": list(self.notes),
+            "mistake": self.mistake,
             "iterations": self.iterations,
             "seconds": self.seconds,
         }

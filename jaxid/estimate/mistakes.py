@@ -1,21 +1,25 @@
-"""Possible mistakes in the data behind a fit that explains little, each tested in turn."""
+"""Possible mistakes in the recordings of a fit that explains little, each tested in turn."""
 
 import dataclasses
 import itertools
 from collections.abc import Iterator
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..effects import Spring
 from ..errors import JaxidError
-from ..estimate import Filtering
-from ..estimate.idim import stack
-from ..estimate.regression import linear_parameters
-from ..estimate.result import DOUBTFUL_PERCENT
-from ..parameters import Bounds
+from ..parameters import Bounds, write_values
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
+from .idim import stack
+from .regression import Filtering, linear_parameters
+from .result import DOUBTFUL_PERCENT
 
+# Relative error, %, above which a mistake is looked for.
+LARGE_PERCENT = 10.0
 # A mistake is named if its correction reduces the squared error to less than this share, and leaves
 # an error that is not doubtful.
 _SHARE = 0.25
@@ -28,22 +32,31 @@ _FACTORS = {
     "in mm or mrad, not in m or rad": 1e-3,
     "in m or rad, not in mm or mrad": 1e3,
 }
+# Factors that correct time stamps.
+_CLOCKS = {
+    "in ms, not in s": 1e-3,
+    "of a clock that is twice as fast": 2.0,
+    "of a clock that is half as fast": 0.5,
+}
 
 
-def likely_cause(loop: ClosedLoop, recordings: Recordings) -> str:
-    """The mistake in the data whose correction improves a regression enough; empty if none.
+def likely_mistake(loop: ClosedLoop, recordings: Recordings) -> str:
+    """The mistake in the recordings whose correction improves a regression enough, or empty.
 
-    Signs, units and the order of joints are tested one at a time. Each is tested by a regression
-    of the inverse dynamics along the filtered motion, with the parameters inside their bounds.
+    Signs, units, the order of joints and the clock are tested one at a time. Each is tested by a
+    regression of the inverse dynamics along the filtered motion, with the parameters inside their
+    bounds. Every joint has a spring and a constant torque in addition, because a missing spring
+    may be described by an inertia of the wrong sign.
     """
     for label, span in _still(recordings):
         return f"{label} moves by {span:.2g} only: record motions of all joints"
+    loop = loop.add(*(Spring(joint=j) for j in range(1, loop.joints + 1)))
     before = _left(loop, recordings)
-    if before is None:
+    if before is None or np.sqrt(np.mean(before**2)) < LARGE_PERCENT:
         return ""
     found = []
-    for said, mended in _mistakes(recordings):
-        after = _left(loop, mended)
+    for said, mended, faster in _mistakes(recordings):
+        after = _left(_at_speeds(loop, faster), mended)
         if after is not None and np.sqrt(np.mean(after**2)) < DOUBTFUL_PERCENT:
             found.append((float(np.mean(after**2)), said))
     size, said = min(found, default=(np.inf, ""))
@@ -86,39 +99,60 @@ def _left(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " joint
     return 100 * np.linalg.norm(rest.reshape(-1, len(size)), axis=0)
 
 
-def _mistakes(recordings: Recordings) -> Iterator[tuple[str, Recordings]]:
-    """Possible mistakes in recordings, each with the recordings corrected for it."""
+def _mistakes(
+    recordings: Recordings,
+) -> Iterator[tuple[str, Recordings, Float[np.ndarray, " joints"]]]:
+    """Possible mistakes, each with the corrected recordings, and the factors on their speeds."""
     n = recordings[0].joints
-    several = [("all joints", np.ones(n))] if n > 1 else []
+    same = np.ones(n)
+    several = [("all joints", same)] if n > 1 else []
     chosen = [(f"joint {j + 1}", np.eye(n)[j]) for j in range(n)] + several
     for label, which in chosen:
-        yield (
-            f"the torque of {label} seems to have the wrong sign",
-            _changed(recordings, tau=1 - 2 * which),
-        )
+        mended = _changed(recordings, tau=1 - 2 * which)
+        yield f"the torque of {label} seems to have the wrong sign", mended, same
     for label, which in chosen:
         for unit, factor in _FACTORS.items():
             scale = 1 + (factor - 1) * which
-            yield (
-                f"the position of {label} seems to be {unit}",
-                _changed(recordings, q=scale),
-            )
+            mended = _changed(recordings, q=scale)
+            yield f"the position of {label} seems to be {unit}", mended, scale
+    for said, factor in _CLOCKS.items():
+        mended = _changed(recordings, time=factor)
+        yield f"the time stamps seem to be {said}", mended, same / factor
     for i, j in itertools.combinations(range(n), 2):
         order = np.arange(n)
         order[[i, j]] = j, i
         swapped = [dataclasses.replace(r, tau=r.tau[:, order]) for r in recordings]
-        yield (
-            f"the torques of joints {i + 1} and {j + 1} seem to be swapped",
-            Recordings.of(swapped),
-        )
+        said = f"the torques of joints {i + 1} and {j + 1} seem to be swapped"
+        yield said, Recordings.of(swapped), same
 
 
-def _changed(recordings: Recordings, q: np.ndarray | float = 1.0, tau: np.ndarray | float = 1.0):
-    """Recordings with positions and torques multiplied by factors."""
+def _at_speeds(loop: ClosedLoop, factors: Float[np.ndarray, " joints"]) -> ClosedLoop:
+    """The loop with signs of velocity that are as sharp at speeds changed by factors.
+
+    Otherwise a friction that is sharper than the model assumes would look like a wrong unit.
+    """
+    chosen, values = [], []
+    for p in loop.parameters:
+        if p.place[0] == "effects" and p.place[2:] == ("smoothing",):
+            effect: Any = loop.effects[int(p.place[1])]
+            chosen.append(p)
+            values.append(float(effect.smoothing) * factors[effect.joint - 1])
+    return write_values(loop, tuple(chosen), jnp.asarray(values)) if chosen else loop
+
+
+def _changed(
+    recordings: Recordings,
+    q: np.ndarray | float = 1.0,
+    tau: np.ndarray | float = 1.0,
+    time: float = 1.0,
+) -> Recordings:
+    """Recordings with positions, torques and times multiplied by factors."""
 
     def one(r: Recording) -> Recording:
         ref = None if r.q_ref is None else r.q_ref * q
-        v = None if r.v is None else r.v * q
-        return dataclasses.replace(r, q=r.q * q, q_ref=ref, v=v, tau=r.tau * tau)
+        v = None if r.v is None else r.v * q / time
+        return dataclasses.replace(
+            r, time=r.time * time, q=r.q * q, q_ref=ref, v=v, tau=r.tau * tau
+        )
 
     return Recordings.of([one(r) for r in recordings])

@@ -1,0 +1,60 @@
+"""Linear least squares with bounds."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .score import WEAK
+
+
+def least_squares(
+    left: Float[np.ndarray, " rows"],
+    columns: Float[np.ndarray, "rows columns"],
+    limits: tuple[Float[np.ndarray, " bounded"], Float[np.ndarray, " bounded"]],
+) -> tuple[Float[np.ndarray, " columns"], Bool[np.ndarray, " columns"]]:
+    """Coefficients of a bounded least-squares problem, and which of them are not at a bound.
+
+    **Arguments:**
+
+    - `left`: right-hand side. `columns`: matrix, with few rows (coordinates in a basis).
+    - `limits`: lower and upper bounds of the first columns; the others have none.
+    """
+    size = np.linalg.norm(columns, axis=0)
+    size[size == 0] = 1.0
+    scaled = columns / size
+    lower, upper = (np.full(len(size), x) for x in (-np.inf, np.inf))
+    lower[: len(limits[0])], upper[: len(limits[1])] = limits
+    taken = np.linalg.lstsq(scaled, left, rcond=1e-9)[0]
+    low, high = lower * size, upper * size
+    if np.all((taken >= low) & (taken <= high)):
+        return taken / size, np.ones(len(size), bool)
+    import scipy
+
+    # The solver needs an interval of positive length, also for a value that may not change.
+    room = 1e-9 * (1 + np.abs(taken).max())
+    found = scipy.optimize.lsq_linear(scaled, left, (low - room, high + room), method="bvls")
+    return np.clip(found.x, low, high) / size, found.active_mask == 0
+
+
+def bounded_amplitudes(
+    gram: Float[np.ndarray, "columns columns"],
+    score: Float[np.ndarray, " columns"],
+    limits: tuple[Float[np.ndarray, " columns"], Float[np.ndarray, " columns"]],
+) -> tuple[Float[np.ndarray, " columns"], float]:
+    """Amplitudes of signatures within their bounds, and the squared error that they explain.
+
+    If all amplitudes are at a bound, they explain nothing.
+
+    **Arguments:**
+
+    - `gram`: products of the signatures with each other. `score`: with the residual.
+    - `limits`: lower and upper bounds.
+    """
+    values, vectors = np.linalg.eigh(gram)
+    strong = values > WEAK
+    if not strong.any():
+        return np.zeros(len(score)), 0.0
+    root = np.sqrt(values[strong])
+    along = vectors[:, strong].T
+    found, free = least_squares(along @ score / root, root[:, None] * along, limits)
+    explained = float(2 * score @ found - found @ gram @ found) if free.any() else 0.0
+    return found, explained

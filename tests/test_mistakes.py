@@ -1,0 +1,113 @@
+"""Mistakes in the data are named: made on purpose in recordings of the independent simulator."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxid
+from jaxid.estimate.mistakes import likely_mistake
+
+CLEAN = Path(jaxid.__file__).parent / "demo" / "clean"
+
+# A body of 2 kg, 0.3 m below a horizontal axis; its inertia about the axis is 0.25 kg·m².
+_PENDULUM = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial>
+<origin xyz="0 0 -0.3"/><mass value="2"/>
+<inertia ixx="0.07" iyy="0.07" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/>
+<axis xyz="0 1 0"/></joint></robot>"""
+
+
+@pytest.fixture(scope="module")
+def clean():
+    """Two recordings of a SCARA as they are."""
+    return jaxid.read(CLEAN / "fit_1.csv", CLEAN / "fit_2.csv")
+
+
+def spoilt(recordings, change):
+    """Every recording with a mistake."""
+    made = [dataclasses.replace(r, **change(r)) for r in recordings]
+    return jaxid.Recordings.of(made)
+
+
+MISTAKES = {
+    "sign of joint 2": (
+        lambda r: {"tau": r.tau * [1, -1]},
+        "torque of joint 2 seems to have the wrong sign",
+    ),
+    "all signs": (lambda r: {"tau": -r.tau}, "torque of all joints seems to have the wrong sign"),
+    "swapped": (lambda r: {"tau": r.tau[:, ::-1]}, "torques of joints 1 and 2"),
+    "degrees": (
+        lambda r: {"q": np.rad2deg(r.q)},
+        "position of all joints seems to be in degrees, not",
+    ),
+    "noise alone": (
+        lambda r: {"q": r.q * [1, 0] + 1e-4 * np.random.default_rng(1).normal(size=r.q.shape)},
+        "joint 2 moves by",
+    ),
+    "still": (lambda r: {"q": r.q * [1, 0]}, "joint 2 moves by 0 only"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_named(clean, name):
+    change, said = MISTAKES[name]
+    assert re.search(said, likely_mistake(jaxid.scara(), spoilt(clean, change)))
+
+
+def test_recordings_without_a_mistake_are_not_blamed(clean):
+    assert likely_mistake(jaxid.scara(), clean) == ""
+
+
+def test_what_is_no_mistake_is_not_named_as_one(clean):
+    """Torque that has nothing to do with the motion."""
+    rng = np.random.default_rng(0)
+    noise = spoilt(clean, lambda r: {"tau": rng.normal(size=r.tau.shape)})
+    assert likely_mistake(jaxid.scara(), noise) == ""
+
+
+def test_a_fast_clock_is_named_under_gravity():
+    """Gravity does not depend on time, inertia does."""
+    time = np.arange(0, 10, 0.01)
+    q = 0.9 * np.sin(1.7 * time) + 0.5 * np.sin(4.1 * time)
+    a = -0.9 * 1.7**2 * np.sin(1.7 * time) - 0.5 * 4.1**2 * np.sin(4.1 * time)
+    tau = 0.25 * a + 2.0 * 9.81 * 0.3 * np.sin(q)
+    right, fast = (
+        jaxid.Recordings.of(jaxid.Recording.from_arrays(t, q, tau, name="pendulum"))
+        for t in (time, time / 2)
+    )
+    loop = jaxid.serial(_PENDULUM, bodies="drawn")
+    assert likely_mistake(loop, right) == ""
+    assert "twice as fast" in likely_mistake(loop, fast)
+
+
+def test_a_missing_spring_is_not_named_as_a_wrong_sign(clean):
+    """At one frequency a spring is the same as an inertia of the wrong sign."""
+    motion, sprung = clean[0], []
+    q = np.stack([0.4 * np.sin(5 * motion.time), 0.5 * np.sin(5 * motion.time + 1)], axis=1)
+    v, a = (np.gradient(x, motion.time, axis=0) for x in (q, np.gradient(q, motion.time, axis=0)))
+    tau = 3.5 * a * [1, 0] + 0.06 * a * [0, 1] + 200 * q + 0.1 * v
+    for name, part in (("one", slice(0, 500)), ("other", slice(500, 1000))):
+        time = motion.time[part]
+        sprung.append(jaxid.Recording.from_arrays(time, q[part], tau[part], name=name))
+    assert likely_mistake(jaxid.scara(), jaxid.Recordings.of(sprung)) == ""
+
+
+def test_a_fit_names_the_mistake_first(clean):
+    change, said = MISTAKES["swapped"]
+    unknown = dataclasses.replace(jaxid.scara(), controller=jaxid.control.Tracking())
+    found = jaxid.fit(unknown, spoilt(clean, change), jaxid.OEM(progress=False))
+    assert re.search(said, found.mistake)
+    assert found.notes[0] == found.mistake
+    assert found.to_dict()["mistake"] == found.mistake
+
+
+def test_no_effect_is_searched_before_a_mistake_is_corrected(clean):
+    change, said = MISTAKES["sign of joint 2"]
+    unknown = dataclasses.replace(jaxid.scara(), controller=jaxid.control.Tracking())
+    story = jaxid.discover(unknown, spoilt(clean, change), progress=False)
+    assert story.verdict == "undetermined"
+    assert len(story.steps) == 1
+    assert re.search(f"{said}.*no effect was searched", story.reason)
