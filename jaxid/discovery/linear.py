@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from ..compiling import compiled
 from ..effects import AbstractTransmission, Motion
 from ..simulation.batch import Batch, Interval
+from ..simulation.compared import compared_table
 from ..simulation.dynamics import link_load
 from ..simulation.integration import SIGNALS, initial
 from ..simulation.loop import ClosedLoop
@@ -147,7 +148,29 @@ def respond(
     - `place`: one of `linear.places`.
     - `values`: one column per hypothesis: N·m or N; rad or m; rad/s or m/s.
     """
-    return one_by_one(lambda one: _response(one[0], place, one[1]), (linear, values))
+    inputs = _inputs(linear, place)
+    # Along an imposed motion a torque changes no state.
+    direct = place in ("push", "pull") and not np.any(np.asarray(linear.B)[..., inputs])
+    response = _direct_response if direct else _response
+    return one_by_one(lambda one: response(one[0], place, one[1]), (linear, values))
+
+
+def _inputs(linear: Linearised, place: Place) -> slice:
+    """The inputs of a place, at the beginning and the end of an interval."""
+    joints, last = linear.motion.q.shape[-1], linear.B.shape[-1]
+    first = last - 2 * joints * (len(linear.places) - linear.places.index(place))
+    return slice(first, first + 2 * joints)
+
+
+@compiled
+def _direct_response(
+    linear: Linearised,
+    place: Place,
+    values: Float[Array, "recordings points joints columns"],
+) -> Float[Array, "recordings points outputs columns"]:
+    d = linear.D[..., _inputs(linear, place)].astype(values.dtype)
+    after = jnp.concatenate([values[:, 1:], values[:, -1:]], axis=1)
+    return d @ jnp.concatenate([values, after], axis=2)
 
 
 @compiled
@@ -156,9 +179,7 @@ def _response(
     place: Place,
     values: Float[Array, "recordings points joints columns"],
 ) -> Float[Array, "recordings points outputs columns"]:
-    joints, last = values.shape[2], linear.B.shape[-1]
-    first = last - 2 * joints * (len(linear.places) - linear.places.index(place))
-    inputs = slice(first, first + 2 * joints)
+    joints, inputs = values.shape[2], _inputs(linear, place)
 
     def times(matrix, columns):
         # In this form XLA fuses the four products into one loop over the columns.
@@ -191,12 +212,16 @@ def sampled(batch: Batch, tree: Any) -> Any:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[rows], tree)
 
 
-def at_samples(batch: Batch, x: Float[np.ndarray, "recordings points *axes"]) -> np.ndarray:
+def at_samples(
+    batch: Batch, x: Float[np.ndarray, "recordings points outputs *columns"]
+) -> Float[np.ndarray, "recordings rows outputs *columns"]:
     """Rows at the samples, in the compared band; zero for padding."""
-    x = sampled(batch, x)
-    mask = np.asarray(batch.mask).reshape(*batch.mask.shape, *(1,) * (x.ndim - 2))
-    x = x * mask.astype(x.dtype)
-    return np.asarray(batch.compared(x), x.dtype)
+    table = sampled(batch, np.asarray(x))
+    columns = table.shape[3:]
+    found = compared_table(
+        batch.band, batch.moving, batch.mask, table.reshape(*table.shape[:3], -1)
+    )
+    return found.reshape(*found.shape[:3], *columns)
 
 
 def at_rows(batch: Batch, tree: Any) -> Any:

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..effects import Spring
 from ..errors import JaxidError
@@ -55,7 +55,7 @@ def likely_mistake(loop: ClosedLoop, recordings: Recordings) -> str:
     if before is None or np.sqrt(np.mean(before**2)) < LARGE_PERCENT:
         return ""
     found = []
-    for said, mended, faster in _mistakes(recordings):
+    for said, mended, faster in _mistakes(recordings, before > LARGE_PERCENT):
         after = _left(_at_speeds(loop, faster), mended)
         if after is not None and np.sqrt(np.mean(after**2)) < DOUBTFUL_PERCENT:
             found.append((float(np.mean(after**2)), said))
@@ -100,13 +100,18 @@ def _left(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " joint
 
 
 def _mistakes(
-    recordings: Recordings,
+    recordings: Recordings, large: Bool[np.ndarray, " joints"]
 ) -> Iterator[tuple[str, Recordings, Float[np.ndarray, " joints"]]]:
-    """Possible mistakes, each with the corrected recordings, and the factors on their speeds."""
+    """Possible mistakes, each with the corrected recordings, and the factors on their speeds.
+
+    **Arguments:**
+
+    - `large`: joints with a large error; mistakes of other joints are not tried.
+    """
     n = recordings[0].joints
     same = np.ones(n)
     several = [("all joints", same)] if n > 1 else []
-    chosen = [(f"joint {j + 1}", np.eye(n)[j]) for j in range(n)] + several
+    chosen = [(f"joint {j + 1}", np.eye(n)[j]) for j in np.flatnonzero(large)] + several
     for label, which in chosen:
         mended = _changed(recordings, tau=1 - 2 * which)
         yield f"the torque of {label} seems to have the wrong sign", mended, same
@@ -119,6 +124,8 @@ def _mistakes(
         mended = _changed(recordings, time=factor)
         yield f"the time stamps seem to be {said}", mended, same / factor
     for i, j in itertools.combinations(range(n), 2):
+        if not (large[i] or large[j]):
+            continue
         order = np.arange(n)
         order[[i, j]] = j, i
         swapped = [dataclasses.replace(r, tau=r.tau[:, order]) for r in recordings]

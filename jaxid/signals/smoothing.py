@@ -174,7 +174,8 @@ class Band(eqx.Module):
         """Filtered signals, with zeros for missing samples and rows."""
         axes = (1,) * (x.ndim - 2)
         size = 2 * (self.gain.shape[1] - 1)
-        wave = jnp.fft.rfft(x, size, axis=1) * self.gain.reshape(*self.gain.shape, *axes)
+        gain = self.gain.astype(x.dtype)
+        wave = jnp.fft.rfft(x, size, axis=1) * gain.reshape(*gain.shape, *axes)
         passed = self.picked(jnp.fft.irfft(wave, size, axis=1))
         return passed * self.keep.reshape(*self.keep.shape, *axes)
 

@@ -15,6 +15,7 @@ from ..effects import recording_label
 from ..errors import JaxidError, ModelError, RecordingError
 from ..recording import Recording, Recordings
 from ..signals.smoothing import Band, shared_length, signal_cutoff
+from .compared import compared_part
 from .loop import ClosedLoop
 
 
@@ -72,12 +73,7 @@ class Batch(eqx.Module):
 
         Missing samples, and rows in which a joint stands still, are zero.
         """
-        passed = x if self.band is None else self.band(jnp.asarray(x))
-        if self.moving is None:
-            return passed
-        # The outputs may be several signals of each joint.
-        moving = jnp.tile(self.moving, passed.shape[2] // self.moving.shape[2])
-        return passed * moving.reshape(*moving.shape, *(1,) * (passed.ndim - 3))
+        return compared_part(self.band, self.moving, jnp.asarray(x))
 
     def uncompared(self) -> "Batch":
         """The batch for a simulation: what is compared would only make programs differ."""
