@@ -193,6 +193,22 @@ def test_superfluous_effect_is_taken_out_and_a_needed_one_stays(offset_case, off
 
 
 @pytest.mark.xdist_group("offset")
+def test_an_effect_that_was_too_small_is_not_added_again(offset_case, offset_story, monkeypatch):
+    """Its prediction may be larger than its fit, so that a search would never end."""
+    monkeypatch.setattr("jaxid.discovery.search.needed", lambda *_: False)
+    search, start = search_of(offset_case), offset_story[0].steps[0]
+    start_model = search._visit((), start.fit)
+    last = with_chain(offset_case, start, TorqueOffset(joint=2))[-1].fit
+    at = search._visit(search._added(last), last)
+    asked, search.asked = search.asked, dataclasses.replace(search.asked, worth=50.0)
+    assert search._without_one(at).names == ()
+    search.asked = asked
+    candidates, _ = search._predicted(start_model)
+    assert len(candidates) > 1
+    assert not any("torque_offset" in (e.effect_name() for e in c.effects) for c in candidates)
+
+
+@pytest.mark.xdist_group("offset")
 def test_a_close_rival_that_was_only_predicted_is_fitted(offset_case, offset_story):
     """A weak spring in the place of the offset; the prediction puts the offset slightly behind."""
     search, start = search_of(offset_case), offset_story[0].steps[0]

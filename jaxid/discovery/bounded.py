@@ -42,19 +42,22 @@ def bounded_amplitudes(
 ) -> tuple[Float[np.ndarray, " columns"], float]:
     """Amplitudes of signatures within their bounds, and the squared error that they explain.
 
-    If all amplitudes are at a bound, they explain nothing.
+    Signatures that the base absorbs have zero amplitude. If all amplitudes are at a bound, they
+    explain nothing.
 
     **Arguments:**
 
     - `gram`: products of the signatures with each other. `score`: with the residual.
     - `limits`: lower and upper bounds.
     """
-    values, vectors = np.linalg.eigh(gram)
+    heard = np.diag(gram) > WEAK
+    found = np.zeros(len(score))
+    if not heard.any():
+        return found, 0.0
+    values, vectors = np.linalg.eigh(gram[np.ix_(heard, heard)])
     strong = values > WEAK
-    if not strong.any():
-        return np.zeros(len(score)), 0.0
-    root = np.sqrt(values[strong])
-    along = vectors[:, strong].T
-    found, free = least_squares(along @ score / root, root[:, None] * along, limits)
+    root, along = np.sqrt(values[strong]), vectors[:, strong].T
+    within = limits[0][heard], limits[1][heard]
+    found[heard], free = least_squares(along @ score[heard] / root, root[:, None] * along, within)
     explained = float(2 * score @ found - found @ gram @ found) if free.any() else 0.0
     return found, explained

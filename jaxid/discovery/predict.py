@@ -21,9 +21,9 @@ from ..parameters import Bounds, read_values, write_values
 from .bounded import least_squares
 from .finite import differences
 from .hypotheses import free_of
-from .linear import at_samples, respond
+from .linear import Place, at_samples, respond
 from .score import Data, spanned
-from .signatures import Placed, force_and_slopes
+from .signatures import Placed, force_and_slopes, torques_of
 from .system import System
 
 # Columns of one response. Missing columns are filled with zeros, so that few programs are compiled.
@@ -178,13 +178,22 @@ class Predictor(eqx.Module):
         system = self.system
         placed = Placed.of(effect, system.loop.joints)
         push, noise, rate = force_and_slopes(placed, system.linear.motion, system.left)
-        place = "pull" if effect.on_link and "pull" in system.linear.places else "push"
-        shown = self._through(place, push)
+        shown = self._through(self._place(effect), push)
         if type(effect).read is not AbstractEffect.read:
             shown = shown + self._through("noise", noise) + self._through("rate", rate)
         return shown
 
-    def _through(self, place: Any, columns) -> np.ndarray:
+    def shown_together(
+        self, effects: Sequence[AbstractEffect]
+    ) -> Float[np.ndarray, "recordings samples outputs effects"]:
+        """Changes of the output by effects of one structure that act on the joint's torque."""
+        push = torques_of(effects, self.system.linear.motion, self.system.left)
+        return self._through(self._place(effects[0]), push)
+
+    def _place(self, effect: AbstractEffect) -> Place:
+        return "pull" if effect.on_link and "pull" in self.system.linear.places else "push"
+
+    def _through(self, place: Place, columns) -> np.ndarray:
         count = columns.shape[-1]
         blocks = []
         for at in range(0, count, _WIDTH):

@@ -1,7 +1,7 @@
 """Release of values that a model holds by default: a smoothing, the delay of recorded torque."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -58,7 +58,7 @@ def released(predictor: Predictor, price: float) -> Release | None:
         free = loop.with_values(**values).free(*held)
         if held:
             change = _signal(predictor, loop.with_values(**values)) - nominal
-            gain = _fall(predictor, _gain(predictor, change))
+            gain = _fall(predictor, _gain(predictor, _compared(predictor, change)))
             return Release(free, f"{' and '.join(held)} estimated", gain)
         start = ", ".join(f"{name} {value:.3g}" for name, value in values.items())
         least = _fall(predictor, price)
@@ -77,25 +77,50 @@ def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str
     """Start values of the shapes whose change explains more than its price, by name.
 
     Smoothing and form of one sign are changed together, because a fit can replace one by the other.
-    Each setting is simulated, and the change of the signal is compared with the residual like the
-    signature of an effect. The compiled program is that of the fitted model.
+    The change of the signal by each setting is compared with the residual like the signature of an
+    effect.
     """
     loop = predictor.system.loop
     names = {p.place: p.name for p in loop.parameters}
     found: dict[str, float] = {}
+    tried: set[tuple] = set()
     for p in (*doubtful(loop), *_estimated_signs(loop)):
-        if p.name in found:
-            continue
         together = [names[(*p.place[:2], what)] for what in _SIGN if p.place[2:] in _SIGNS]
-        gain = _gain if p.place not in {q.place for q in loop.free_parameters} else _instead(p)
+        free = p.place in {q.place for q in loop.free_parameters}
+        # A smoothing and a form that are both held, or both free, have the same settings.
+        setting = (tuple(together) or p.name), free
+        if p.name in found or setting in tried:
+            continue
+        tried.add(setting)
+        gain = _instead(p) if free else _gain
         best: dict[str, float] = {}
         most = price
-        for values in _settings(p, together, loop):
-            change = _signal(predictor, loop.with_values(**values)) - nominal
+        settings = _settings(p, together, loop)
+        for values, change in zip(settings, _changes(predictor, p, settings, nominal), strict=True):
             if np.isfinite(change).all() and (explained := gain(predictor, change)) > most:
                 best, most = values, explained
         found |= best
     return found
+
+
+def _changes(
+    predictor: Predictor, p: Parameter, settings: Sequence[dict[str, float]], nominal: np.ndarray
+) -> Iterator[Float[np.ndarray, "recordings rows outputs"]]:
+    """Changes of the compared signal by settings of the effect of a parameter.
+
+    Along an imposed motion an effect adds its own torque. Otherwise each setting is simulated by
+    the compiled program of the fitted model.
+    """
+    loop = predictor.system.loop
+    if not imposed(loop):
+        for values in settings:
+            yield _compared(predictor, _signal(predictor, loop.with_values(**values)) - nominal)
+        return
+    place = int(p.place[1])
+    own = [loop.with_values(**values).effects[place] for values in ({}, *settings)]
+    shown = predictor.shown_together(own)
+    for k in range(1, len(own)):
+        yield shown[..., k] - shown[..., 0]
 
 
 def _estimated_signs(loop: ClosedLoop) -> list[Parameter]:
@@ -122,8 +147,7 @@ def _instead(sign: Parameter) -> Callable[[Predictor, np.ndarray], float]:
         kept = base[..., np.concatenate([~gone, np.ones(base.shape[-1] - len(gone), bool)])]
         white = predictor.data.white(kept, predictor.noise)
         basis = spanned(white.reshape(-1, white.shape[-1]))
-        seen = _compared(predictor, change)
-        rest = predictor.data.white(predictor.data.residual - seen, predictor.noise).reshape(-1)
+        rest = predictor.data.white(predictor.data.residual - change, predictor.noise).reshape(-1)
         rest = rest - basis @ (basis.T @ rest)
         now = _white(predictor, predictor.data.residual)
         return float(now @ now - rest @ rest)
@@ -141,7 +165,7 @@ def _settings(p: Parameter, together: list[str], loop: ClosedLoop) -> list[dict[
     # Multiplication does not change a value at the bound zero.
     scale = next(q.declaration.scale for q in signs if q.name == smoothing)
     centre = named[smoothing] if named[smoothing] > _NOTHING * scale else scale
-    # A simulation along an imposed motion costs almost nothing.
+    # Along an imposed motion a setting costs almost nothing.
     fine = imposed(loop)
     factors = (0.2, 0.4, 0.7, 1.0, 1.5, 2.5, 5.0) if fine else (0.2, 1.0, 5.0)
     forms = (0.0, 0.3, 0.6, 1.0) if fine else (0.0, 1.0)
@@ -166,7 +190,8 @@ def _lateness(predictor: Predictor, nominal: np.ndarray, price: float) -> tuple[
         return 0.0, 0.0
     time = np.asarray(system.batch.time)
     step = float(np.median(np.diff(time[0])))
-    late, gain = _held_against(predictor, np.gradient(nominal, step, axis=1))
+    rate = _compared(predictor, np.gradient(nominal, step, axis=1))
+    late, gain = _held_against(predictor, rate)
     delay = late + getattr(system.loop.controller, "delay", 0.0)
     small = abs(late) < _NOTHING * step
     return (0.0 if gain < price or small or abs(delay) > _LATE * step else late), gain
@@ -186,16 +211,15 @@ def _fall(predictor: Predictor, gain: float) -> float:
 
 
 def _gain(predictor: Predictor, change: np.ndarray) -> float:
-    """What a change explains of the squared error, at its own size or at the best positive size."""
+    """What a compared change explains of the squared error, at its own or the best size."""
     along, gain = _held_against(predictor, change)
     size = gain / max(along**2, 1e-300)
     return max((2 * along - 1) * size, gain if along > 0 else 0.0)
 
 
 def _held_against(predictor: Predictor, change: np.ndarray) -> tuple[float, float]:
-    """The best multiple of a change, and what it explains of the squared error."""
-    seen = _compared(predictor, change)
-    shown, residual = (_white(predictor, x) for x in (seen, predictor.data.residual))
+    """The best multiple of a compared change, and what it explains of the squared error."""
+    shown, residual = (_white(predictor, x) for x in (change, predictor.data.residual))
     along, size = float(residual @ shown), max(float(shown @ shown), 1e-300)
     return along / size, along**2 / size
 

@@ -70,6 +70,7 @@ class Search:
         self.visited = Visited()
         self.forms = 0
         self.removed: tuple[Named, ...] = ()
+        self.small: set[tuple] = set()
         self.failures: tuple[str, ...] = ()
         self.latest: tuple[Screened, Diagnosis] | None = None
         self.diagnoses: dict[tuple, Diagnosis] = {}
@@ -161,7 +162,11 @@ class Search:
         self.seen = at.fit, landscape.predictor
         plain = next(c for c in candidates if not c.effects and c.curve is None)
         worth = self.asked.worth
-        kept = [c for c in candidates if c is plain or matters(at, c, plain, worth)]
+        kept = [
+            c
+            for c in candidates
+            if c is plain or (not self.small.intersection(c.key) and matters(at, c, plain, worth))
+        ]
         return kept, plain.score
 
     def _released(self, at: Model, candidates: Sequence[Candidate], nothing: float) -> Model | None:
@@ -312,7 +317,9 @@ class Search:
         small = [m for m in found if not loses(m, at, self.asked.worth)]
         best = min(small, key=lambda m: m.score, default=None)
         if best is not None:
-            # The removed effect is too small to matter, also in other sets.
+            # The removed effect is too small to matter, also in other sets. A prediction that is
+            # too large must not add it again.
+            self.small |= (Counter(at.key) - Counter(best.key)).keys()
             self.visited.forget(set(at.key) - set(best.key))
         return best
 

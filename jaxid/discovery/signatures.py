@@ -208,6 +208,33 @@ def _force_and_slopes(
     return each(of_run, motion, left)
 
 
+def torques_of(
+    effects: Sequence[AbstractEffect],
+    motion: Motion,
+    left: Float[Array, "recordings points joints"],
+) -> Float[Array, "recordings points joints effects"]:
+    """Torque on the joints by effects of one structure at their values, N·m or N.
+
+    **Arguments:** as for `force_and_slopes`.
+    """
+    ((stacked, _),) = _grouped(effects, motion.q.shape[-1])
+    return one_by_one(lambda one: _torques_of(stacked, one[0], one[1]), (motion, left))
+
+
+@compiled
+def _torques_of(
+    stacked: Placed, motion: Motion, left: Float[Array, "recordings points joints"]
+) -> Float[Array, "recordings points joints effects"]:
+    def of_run(run: Motion, left):
+        def own(placed: Placed):
+            by = _force_by(placed.effect, (), placed.motion(run), left[:, placed.order])
+            return placed.back(by(jnp.zeros(0))[0])
+
+        return jnp.moveaxis(eqx.filter_vmap(own, in_axes=eqx.if_array(0))(stacked), 0, -1)
+
+    return each(of_run, motion, left)
+
+
 def left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings points joints"]:
     """Torque that remains for the links after the loop's effects on the drives, along the runs."""
     return one_by_one(lambda one: _left_for_links(loop, one), motion)
