@@ -76,10 +76,11 @@ def recordings(
 def problem(loop: jaxid.ClosedLoop, batch: Batch, mesh: jax.sharding.Mesh | None = None) -> Problem:
     """The problem that `OEM` minimises, with white noise and starts at rest."""
     bounds, count = Bounds.of(loop.free_parameters), batch.q0.shape[0]
-    white = jnp.zeros((2, 16)).at[:, 0].set(1.0)
+    white = jnp.zeros((loop.joints, 16)).at[:, 0].set(1.0)
     ends = bounds.lower, bounds.upper
     kinds = ("tau",), False, mesh
-    return Problem(loop, batch, jnp.ones(2), white, jnp.zeros(count), *ends, *kinds)
+    ones, rest = jnp.ones(loop.joints), jnp.zeros(count)
+    return Problem(loop, batch, ones, white, rest, *ends, *kinds)
 
 
 def arrays(recs: jaxid.Recordings) -> list[dict[str, np.ndarray]]:

@@ -23,6 +23,12 @@ ROBOTS = {
     "kinova": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
     "panda": ("panda_description/urdf/panda.urdf", "panda_link8"),
 }
+# The same up to an earlier link; the other joints are locked.
+PARTS = {
+    "ur5_1": (ROBOTS["ur5"][0], "shoulder_link"),
+    "ur5_2": (ROBOTS["ur5"][0], "upper_arm_link"),
+    "ur5_3": (ROBOTS["ur5"][0], "forearm_link"),
+}
 TICK, STEPS = 1e-3, 10
 STEP = TICK / STEPS
 
@@ -40,7 +46,7 @@ def folder() -> Path:
 
 def arm_alone(name: str) -> tuple[ET.Element, str]:
     """The robot's URDF without meshes, with fixed fingers, and the last link of the arm."""
-    path, tip = ROBOTS[name]
+    path, tip = (ROBOTS | PARTS)[name]
     root = ET.parse(folder() / path).getroot()
     for link in root.findall("link"):
         for what in ("visual", "collision"):

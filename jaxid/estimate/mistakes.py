@@ -23,6 +23,8 @@ LARGE_PERCENT = 10.0
 # A mistake is named if its correction reduces the squared error to less than this share, and leaves
 # an error that is not doubtful.
 _SHARE = 0.25
+# Weight of the coefficients of columns of unit length in the regressions.
+_RIDGE = 1e-3
 # Range of a long recording of white noise, in standard deviations.
 _STILL = 12.0
 # Factors between units that are often confused.
@@ -94,7 +96,10 @@ def _left(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " joint
     if not np.isfinite(columns).all():
         return None
     limits = np.asarray(bounds.lower) * length, np.asarray(bounds.upper) * length
-    found = scipy.optimize.lsq_linear(columns / length, right, limits)
+    # Almost equal columns, such as the gravity terms of small angles, must not become polynomials.
+    p = len(length)
+    penalised = np.concatenate([columns / length, _RIDGE * np.eye(p)])
+    found = scipy.optimize.lsq_linear(penalised, np.append(right, np.zeros(p)), limits)
     rest = right - columns / length @ found.x
     return 100 * np.linalg.norm(rest.reshape(-1, len(size)), axis=0)
 
