@@ -9,20 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..effects import Spring
+from ..effects import RotorInertia
 from ..errors import JaxidError
-from ..parameters import Bounds, write_values
+from ..parameters import Bounds, Parameter, write_values
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from .idim import stack
-from .regression import Filtering, linear_parameters
-from .result import DOUBTFUL_PERCENT
+from .regression import Filtering, decimator, filtered, linear_parameters
 
 # Relative error, %, above which a mistake is looked for.
 LARGE_PERCENT = 10.0
-# A mistake is named if its correction reduces the squared error to less than this share, and leaves
-# an error that is not doubtful.
-_SHARE = 0.25
+# A mistake is named if its correction reduces the squared error to less than this share, and the
+# relative error to less than this, %.
+_SHARE, _GOOD = 0.25, 20.0
 # Weight of the coefficients of columns of unit length in the regressions.
 _RIDGE = 1e-3
 # Range of a long recording of white noise, in standard deviations.
@@ -47,19 +46,22 @@ def likely_mistake(loop: ClosedLoop, recordings: Recordings) -> str:
 
     Signs, units, the order of joints and the clock are tested one at a time. Each is tested by a
     regression of the inverse dynamics along the filtered motion, with the parameters inside their
-    bounds. Every joint has a spring and a constant torque in addition, because a missing spring
-    may be described by an inertia of the wrong sign.
+    bounds. Every joint has in addition an inertia of any sign, and a torque that is a cubic
+    function of its position: wrong bodies may look like a wrong unit, and a missing spring like an
+    inertia of the wrong sign.
     """
     for label, span in _still(recordings):
         return f"{label} moves by {span:.2g} only: record motions of all joints"
-    loop = loop.add(*(Spring(joint=j) for j in range(1, loop.joints + 1)))
+    had = {e.joint for e in loop.effects if isinstance(e, RotorInertia)}
+    loop = loop.add(*(RotorInertia(joint=j) for j in range(1, loop.joints + 1) if j not in had))
+    loop = loop.free(*(p.name for p in loop.parameters if _of_rotor(p, loop)))
     before = _left(loop, recordings)
     if before is None or np.sqrt(np.mean(before**2)) < LARGE_PERCENT:
         return ""
     found = []
     for said, mended, faster in _mistakes(recordings, before > LARGE_PERCENT):
         after = _left(_at_speeds(loop, faster), mended)
-        if after is not None and np.sqrt(np.mean(after**2)) < DOUBTFUL_PERCENT:
+        if after is not None and np.sqrt(np.mean(after**2)) < _GOOD:
             found.append((float(np.mean(after**2)), said))
     size, said = min(found, default=(np.inf, ""))
     if not size < _SHARE * np.mean(before**2):
@@ -83,25 +85,54 @@ def _left(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " joint
     """Relative error of each joint's torque in a bounded regression, %; None if it fails."""
     import scipy
 
+    filtering = Filtering()
     try:
-        stacked = stack(loop, recordings, Filtering())
-        bounds = Bounds.of(linear_parameters(loop))
+        motions = [filtered(r, filtering.on(r)) for r in recordings]
+        stacked = stack(loop, recordings, filtering, motions)
+        chosen = linear_parameters(loop)
     except JaxidError:
         return None
-    size = np.maximum(np.linalg.norm(stacked.right, axis=0), 1e-300)
-    columns = (stacked.columns / size[:, None]).reshape(-1, stacked.columns.shape[-1])
+    reduce = [decimator(r, filtering.on(r)) for r in recordings]
+    q, tau = (
+        np.concatenate([to(getattr(m, x)) for to, m in zip(reduce, motions, strict=True)])
+        for x in ("q", "tau")
+    )
+    wide = np.concatenate([stacked.columns, _of_position(q)], axis=-1)
+    # Relative to the recorded torque; the right-hand side is without that of held bodies.
+    size = np.maximum(np.linalg.norm(tau, axis=0), 1e-300)
+    columns = (wide / size[:, None]).reshape(-1, wide.shape[-1])
     right = (stacked.right / size).ravel()
     length = np.linalg.norm(columns, axis=0)
     length[length == 0] = 1.0
     if not np.isfinite(columns).all():
         return None
-    limits = np.asarray(bounds.lower) * length, np.asarray(bounds.upper) * length
+    bounds = Bounds.of(chosen)
+    rotor = np.repeat([_of_rotor(p, loop) for p in chosen], [p.size for p in chosen])
+    low, high = np.where(rotor, -np.inf, bounds.lower), np.asarray(bounds.upper)
+    open_ = np.full(wide.shape[-1] - len(low), np.inf)
+    limits = np.append(low, -open_) * length, np.append(high, open_) * length
     # Almost equal columns, such as the gravity terms of small angles, must not become polynomials.
     p = len(length)
     penalised = np.concatenate([columns / length, _RIDGE * np.eye(p)])
     found = scipy.optimize.lsq_linear(penalised, np.append(right, np.zeros(p)), limits)
     rest = right - columns / length @ found.x
     return 100 * np.linalg.norm(rest.reshape(-1, len(size)), axis=0)
+
+
+def _of_rotor(p: Parameter, loop: ClosedLoop) -> bool:
+    """Whether a parameter is the inertia of a rotor."""
+    return p.place[0] == "effects" and isinstance(loop.effects[int(p.place[1])], RotorInertia)
+
+
+def _of_position(
+    q: Float[np.ndarray, "samples joints"],
+) -> Float[np.ndarray, "samples joints columns"]:
+    """Torque on each joint by the powers 0 to 3 of its position in the middle of its range."""
+    low, high = q.min(axis=0), q.max(axis=0)
+    x = (2 * q - low - high) / np.maximum(high - low, 1e-300)
+    powers = np.stack([x**k for k in range(4)], axis=-1)
+    own = np.eye(q.shape[1])[None, :, :, None] * powers[:, None]
+    return own.reshape(*q.shape, -1)
 
 
 def _mistakes(
