@@ -87,6 +87,22 @@ def test_memory_is_measured_by_length(tmp_path):
 
 
 @pytest.mark.slow
+def test_time_and_memory_are_measured_by_joints(tmp_path):
+    rows = {row["task"]: row for row in _quick("joints", tmp_path)}
+    assert list(rows) == ["simulation", "Jacobian"]
+    for row in rows.values():
+        assert row["joints"] == 2
+        assert row["peak_MiB"] >= row["before_MiB"] > 0
+        assert row["first_s"] > row["again_s"] > 0
+
+
+@pytest.mark.slow
+def test_a_mistake_in_recordings_is_named_and_gives_no_sure_verdict(tmp_path):
+    rows = _quick("mistakes", tmp_path)
+    assert [(row["verdict"], row["named"]) for row in rows] == [("undetermined", True)] * 2
+
+
+@pytest.mark.slow
 def test_settings_of_the_process_are_each_taken_away(tmp_path):
     rows = {(row["task"], row["setting"]): row for row in _quick("process", tmp_path)}
     assert {task for task, _ in rows} == {"simulation", "Jacobian", "whole fit"}

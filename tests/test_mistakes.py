@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxid
-from jaxid.estimate.mistakes import likely_mistake
+from jaxid.estimate.mistakes import at_limit, likely_mistake
 
 CLEAN = Path(jaxid.__file__).parent / "demo" / "clean"
 
@@ -80,6 +80,13 @@ def test_a_missing_spring_is_not_named_as_a_wrong_sign(clean):
         time = motion.time[part]
         sprung.append(jaxid.Recording.from_arrays(time, q[part], tau[part], name=name))
     assert likely_mistake(jaxid.scara(), jaxid.Recordings.of(sprung)) == ""
+
+
+def test_a_torque_that_is_often_at_its_largest_value_is_named(clean):
+    top = 0.5 * max(np.abs(r.tau[:, 1]).max() for r in clean)
+    limited = spoilt(clean, lambda r: {"tau": np.clip(r.tau, [-np.inf, -top], [np.inf, top])})
+    assert at_limit(clean) == ""
+    assert re.fullmatch("the torque of joint 2 is at its .* may be at its limit", at_limit(limited))
 
 
 def test_a_fit_names_the_mistake_first(clean):

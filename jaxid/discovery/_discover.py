@@ -158,11 +158,9 @@ def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step], models: Sequ
     if first.fit.mistake:
         return f"{first.fit.mistake}; no effect was searched, so correct this first"
     if verdict == "outside_catalogue":
-        # A curve can absorb the residual of a model that explains almost nothing.
-        blind = last.fit.status is Status.misfit and last.fit.error_percent.min(axis=None) > 99
-        if blind:
+        # A curve can absorb the residual of a model that explains nothing, and so can effects.
+        if last.fit.status is Status.misfit:
             return misfit_of(last.fit)
-        # So can added effects.
         assert last.diagnosis is not None
         measured = last.diagnosis.measured
         return explains_little(last.fit, search.at.noise, measured) if last is not first else ""

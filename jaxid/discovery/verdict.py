@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..estimate import Fit, Status
+from ..estimate.mistakes import at_limit
 from ..estimate.result import DOUBTFUL_PERCENT, joint_columns
 from ..noise import ARFilter
 from ..simulation.dynamics import imposed
@@ -44,9 +45,13 @@ def misfit_of(fit: Fit) -> str:
 
 def _to_check(fit: Fit) -> str:
     """The mistake in the data that explains a misfit, or what to check."""
-    return fit.mistake or (
-        "check the units of each joint, signs, the order of the joints, time stamps and the "
-        "control law"
+    return (
+        fit.mistake
+        or at_limit(fit.recordings)
+        or (
+            "check the units of each joint, signs, the order of the joints, time stamps and the "
+            "control law"
+        )
     )
 
 

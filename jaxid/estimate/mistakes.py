@@ -22,6 +22,8 @@ LARGE_PERCENT = 10.0
 # A mistake is named if its correction reduces the squared error to less than this share, and the
 # relative error to less than this, %.
 _SHARE, _GOOD = 0.25, 20.0
+# Share of samples at the largest torque above which a drive may be at its limit.
+_OFTEN = 0.05
 # Weight of the coefficients of columns of unit length in the regressions.
 _RIDGE = 1e-3
 # Range of a long recording of white noise, in standard deviations.
@@ -70,6 +72,21 @@ def likely_mistake(loop: ClosedLoop, recordings: Recordings) -> str:
         f"{said}: with this corrected, the error of a regression is {np.sqrt(size):.2g} % instead "
         f"of {np.sqrt(np.mean(before**2)):.3g} %"
     )
+
+
+def at_limit(recordings: Recordings) -> str:
+    """The joints whose torque often has one largest value, as a sentence; empty if there are none.
+
+    It is no mistake, because a limited drive can be part of the model.
+    """
+    tau = np.concatenate([np.abs(r.tau) for r in recordings])
+    share = np.mean(tau >= (1 - 1e-9) * tau.max(axis=0), axis=0)
+    said = [
+        f"the torque of joint {j + 1} is at its largest value in {100 * share[j]:.0f} % of the "
+        "samples, so its drive may be at its limit"
+        for j in np.flatnonzero(share > _OFTEN)
+    ]
+    return " and ".join(said)
 
 
 def _still(recordings: Recordings) -> Iterator[tuple[str, float]]:
