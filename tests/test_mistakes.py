@@ -96,6 +96,8 @@ def test_a_fit_names_the_mistake_first(clean):
     assert re.search(said, found.mistake)
     assert found.notes[0] == found.mistake
     assert found.to_dict()["mistake"] == found.mistake
+    diagnosed = repr(jaxid.diagnose(found, progress=False))
+    assert re.search(f"{said}.*correct this first", diagnosed.splitlines()[0])
 
 
 def test_no_effect_is_searched_before_a_mistake_is_corrected(clean):
