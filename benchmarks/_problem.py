@@ -125,6 +125,13 @@ def interleaved(
     return best
 
 
+def peak_memory() -> float:
+    """Largest resident set of this process, MiB."""
+    # `resource` would include the memory of the parent when it started this process.
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line.split()[1] for line in lines if line.startswith("VmHWM"))) / 1024
+
+
 def machine() -> str:
     """Processor and versions, one line."""
     names = [

@@ -32,7 +32,7 @@ from jaxid.simulation.batch import prepare
 from jaxid.simulation.steps import with_substeps
 
 from ._output import options, report
-from ._problem import machine, problem
+from ._problem import machine, peak_memory, problem
 
 # Arms by number of joints.
 ARMS = {1: "ur5_1", 2: "ur5_2", 3: "ur5_3", 6: "ur5", 7: "panda"}
@@ -52,13 +52,13 @@ def measure(robot: str, task: str) -> None:
     case = bench.make(bench.Wanted(0, 5, robot, "", "free"))
     recordings = jaxid.Recordings.of(case.recordings[:2])
     run = _task(case.loop, recordings, task)
-    before, took = _peak(), []
+    before, took = peak_memory(), []
     for _ in range(1 if task == "discovery" else 2):
         started = time.process_time()
         jax.block_until_ready(run())
         took.append(time.process_time() - started)
     again = took[1] if len(took) > 1 else None
-    row = {"first_s": took[0], "again_s": again, "before_MiB": before, "peak_MiB": _peak()}
+    row = {"first_s": took[0], "again_s": again, "before_MiB": before, "peak_MiB": peak_memory()}
     print(json.dumps(row))
 
 
@@ -92,12 +92,6 @@ def _known(
     law = jaxid.control.PD(Kp=400.0 * inertia, Kv=40.0 * inertia)
     known = jaxid.ClosedLoop(loop.arm, law, loop.effects)
     return with_substeps(known, jaxid.Recordings.of(fine)), fine
-
-
-def _peak() -> float:
-    """Largest resident set of this process, MiB."""
-    with open("/proc/self/status", encoding="ascii") as lines:
-        return int(next(x.split()[1] for x in lines if x.startswith("VmHWM"))) / 1024
 
 
 def row(joints: int, task: str) -> dict[str, Any]:

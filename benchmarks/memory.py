@@ -20,7 +20,7 @@ import pandas as pd
 import jaxid
 
 from ._output import options, report
-from ._problem import cad, machine, recordings
+from ._problem import cad, machine, peak_memory, recordings
 
 PERIOD = 1e-3
 
@@ -42,20 +42,19 @@ def fitted(path: str) -> None:
     loop = jaxid.ClosedLoop(
         cad().arm, cad().controller, cad().effects, stepping=jaxid.Stepping(substeps=1)
     )
-    before, seconds = _peak(), []
+    before, seconds = peak_memory(), []
     for _ in range(2):
         begun = time.perf_counter()
         fit = jaxid.fit(loop, recording, jaxid.OEM(progress=False))
         seconds.append(time.perf_counter() - begun)
     found = {"succeeded": fit.succeeded, "iterations": fit.iterations}
-    found |= {"cold_s": seconds[0], "warm_s": seconds[1], "before_MiB": before, "peak_MiB": _peak()}
+    found |= {
+        "cold_s": seconds[0],
+        "warm_s": seconds[1],
+        "before_MiB": before,
+        "peak_MiB": peak_memory(),
+    }
     print(json.dumps(found))
-
-
-def _peak() -> float:
-    # `resource` would include the memory of the parent when it started this process.
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return int(next(line.split()[1] for line in lines if line.startswith("VmHWM"))) / 1024
 
 
 def row(minutes: float) -> dict[str, Any]:

@@ -4,11 +4,14 @@ import dataclasses
 import re
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxid
+from jaxid.effects import AbstractEffect, Motion
 from jaxid.estimate.mistakes import at_limit, likely_mistake
+from jaxid.parameters import Scalar, parameter
 
 CLEAN = Path(jaxid.__file__).parent / "demo" / "clean"
 
@@ -48,6 +51,21 @@ MISTAKES = {
 def test_a_mistake_is_named(clean, name):
     change, said = MISTAKES[name]
     assert re.search(said, likely_mistake(jaxid.scara(), spoilt(clean, change)))
+
+
+class Fan(AbstractEffect):
+    """A friction of the whole arm, with a smoothing and without a joint."""
+
+    smoothing: Scalar = parameter(0.1, symbol="w", unit="rad/s", free=False, scale=0.1)
+    level: Scalar = parameter(0.0, symbol="fan", unit="N·m", scale=0.1)
+
+    def torque(self, motion: Motion):
+        return self.level * jnp.tanh(motion.v / self.smoothing)
+
+
+def test_an_effect_without_a_joint_may_have_a_smoothing(clean):
+    change, said = MISTAKES["degrees"]
+    assert re.search(said, likely_mistake(jaxid.scara().add(Fan()), spoilt(clean, change)))
 
 
 def test_recordings_without_a_mistake_are_not_blamed(clean):

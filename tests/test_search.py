@@ -259,13 +259,13 @@ def test_amplitudes_within_bounds_are_those_of_scipy():
     columns, left = rng.standard_normal((2, 40, 3))[0], rng.standard_normal(40)
     columns[:, 2] -= left
     gram, score_ = columns.T @ columns, columns.T @ left
-    found, explained = bounded_amplitudes(gram, score_, (np.zeros(3), np.full(3, np.inf)))
+    limits, size = ((0.0,) * 3, (np.inf,) * 3), np.array([2.0, 1.0, 0.5])
+    found, explained = bounded_amplitudes(gram, score_, size, limits)
     expected, rest = scipy.optimize.nnls(columns, left)
     assert 0.0 in expected
-    np.testing.assert_allclose(found, expected, atol=1e-8)
+    np.testing.assert_allclose(found * size, expected, atol=1e-8)
     assert explained == pytest.approx(left @ left - rest**2)
-    away = bounded_amplitudes(gram, -score_ * [0, 0, 0], (np.zeros(3), np.full(3, np.inf)))
-    assert away[1] == 0.0
+    assert bounded_amplitudes(gram, np.full(3, -1.0), size, limits)[1] == 0.0
 
 
 @pytest.mark.xdist_group("offset")

@@ -78,7 +78,7 @@ def fit(
         found = estimate.fit(loop, reading.fitted(files), methods[method]())
         typer.echo(repr(found).partition("\n")[0] if quiet else repr(found))
         write_json(json_file, found.to_dict())
-        if not found.succeeded or estimate.doubtful_joints(found):
+        if not found.succeeded or found.mistake or estimate.doubtful_joints(found):
             raise typer.Exit(1)
 
 

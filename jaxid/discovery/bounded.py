@@ -1,5 +1,7 @@
 """Linear least squares with bounds."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -38,7 +40,8 @@ def least_squares(
 def bounded_amplitudes(
     gram: Float[np.ndarray, "columns columns"],
     score: Float[np.ndarray, " columns"],
-    limits: tuple[Float[np.ndarray, " columns"], Float[np.ndarray, " columns"]],
+    size: Float[np.ndarray, " columns"],
+    limits: tuple[Sequence[float], Sequence[float]],
 ) -> tuple[Float[np.ndarray, " columns"], float]:
     """Amplitudes of signatures within their bounds, and the squared error that they explain.
 
@@ -47,8 +50,9 @@ def bounded_amplitudes(
 
     **Arguments:**
 
-    - `gram`: products of the signatures with each other. `score`: with the residual.
-    - `limits`: lower and upper bounds.
+    - `gram`: products of the scaled signatures with each other. `score`: with the residual.
+    - `size`: norms by which the signatures were divided.
+    - `limits`: lower and upper bounds of the amplitudes, in their own units.
     """
     heard = np.diag(gram) > WEAK
     found = np.zeros(len(score))
@@ -57,7 +61,9 @@ def bounded_amplitudes(
     values, vectors = np.linalg.eigh(gram[np.ix_(heard, heard)])
     strong = values > WEAK
     root, along = np.sqrt(values[strong]), vectors[:, strong].T
-    within = limits[0][heard], limits[1][heard]
-    found[heard], free = least_squares(along @ score[heard] / root, root[:, None] * along, within)
+    low, high = (np.asarray(x)[heard] * size[heard] for x in limits)
+    left, columns = along @ score[heard] / root, root[:, None] * along
+    found[heard], free = least_squares(left, columns, (low, high))
     explained = float(2 * score @ found - found @ gram @ found) if free.any() else 0.0
+    found[heard] /= size[heard]
     return found, explained

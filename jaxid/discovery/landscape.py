@@ -124,11 +124,11 @@ class Landscape(eqx.Module):
     ) -> Entry | None:
         """A hypothesis with amplitudes inside their bounds; None if all of them are at a bound."""
         size = self.gram.size[list(hypothesis.columns)]
-        limits = np.array(hypothesis.lower) * size, np.array(hypothesis.upper) * size
-        amplitude, explained = bounded_amplitudes(gram, score, limits)
+        limits = hypothesis.lower, hypothesis.upper
+        amplitude, explained = bounded_amplitudes(gram, score, size, limits)
         if not explained > 0.0:
             return None
-        effect = _sized(hypothesis.effect, amplitude / size)
+        effect = _sized(hypothesis.effect, amplitude)
         return Entry(hypothesis, float(explained - price), effect)
 
 

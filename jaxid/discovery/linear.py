@@ -31,7 +31,8 @@ class Linearised(eqx.Module):
     of `places` at both ends of an interval: torque on the drives (`push`), additions to the
     positions (`noise`) and velocities (`rate`) that the sensors read, and torque on the links
     (`pull`) if transmissions or load-dependent friction separate them from the drives. Each leaf
-    has `(recordings, points)` first. `motion` is the nominal motion, `seen` the signals of
+    has `(recordings, points)` first. `direct` is true along an imposed motion, where torques change
+    no state. `motion` is the nominal motion, `seen` the signals of
     `SIGNALS`.
     """
 
@@ -43,6 +44,13 @@ class Linearised(eqx.Module):
     motion: Motion
     seen: Float[Array, "recordings points 5 joints"]
     places: tuple[Place, ...] = eqx.field(static=True)
+    direct: bool = eqx.field(static=True, default=False)
+
+    def inputs(self, place: Place) -> slice:
+        """The inputs of a place, at the beginning and the end of an interval."""
+        joints, last = self.motion.q.shape[-1], self.B.shape[-1]
+        first = last - 2 * joints * (len(self.places) - self.places.index(place))
+        return slice(first, first + 2 * joints)
 
 
 def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
@@ -53,7 +61,10 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     - `output`: which of `SIGNALS` is compared.
     """
     batch = batch.uncompared()
-    return one_by_one(lambda one: _linearised(loop, one, output), batch)
+    linear = one_by_one(lambda one: _linearised(loop, one, output), batch)
+    torques = [linear.inputs(place) for place in ("push", "pull") if place in linear.places]
+    direct = not any(np.any(np.asarray(linear.B[..., inputs])) for inputs in torques)
+    return dataclasses.replace(linear, direct=direct)
 
 
 @compiled
@@ -148,29 +159,7 @@ def respond(
     - `place`: one of `linear.places`.
     - `values`: one column per hypothesis: N·m or N; rad or m; rad/s or m/s.
     """
-    inputs = _inputs(linear, place)
-    # Along an imposed motion a torque changes no state.
-    direct = place in ("push", "pull") and not np.any(np.asarray(linear.B)[..., inputs])
-    response = _direct_response if direct else _response
-    return one_by_one(lambda one: response(one[0], place, one[1]), (linear, values))
-
-
-def _inputs(linear: Linearised, place: Place) -> slice:
-    """The inputs of a place, at the beginning and the end of an interval."""
-    joints, last = linear.motion.q.shape[-1], linear.B.shape[-1]
-    first = last - 2 * joints * (len(linear.places) - linear.places.index(place))
-    return slice(first, first + 2 * joints)
-
-
-@compiled
-def _direct_response(
-    linear: Linearised,
-    place: Place,
-    values: Float[Array, "recordings points joints columns"],
-) -> Float[Array, "recordings points outputs columns"]:
-    d = linear.D[..., _inputs(linear, place)].astype(values.dtype)
-    after = jnp.concatenate([values[:, 1:], values[:, -1:]], axis=1)
-    return d @ jnp.concatenate([values, after], axis=2)
+    return one_by_one(lambda one: _response(one[0], place, one[1]), (linear, values))
 
 
 @compiled
@@ -179,7 +168,11 @@ def _response(
     place: Place,
     values: Float[Array, "recordings points joints columns"],
 ) -> Float[Array, "recordings points outputs columns"]:
-    joints, inputs = values.shape[2], _inputs(linear, place)
+    joints, inputs = values.shape[2], linear.inputs(place)
+    if linear.direct and place in ("push", "pull"):
+        after = jnp.concatenate([values[:, 1:], values[:, -1:]], axis=1)
+        both = jnp.concatenate([values, after], axis=2)
+        return linear.D[..., inputs].astype(values.dtype) @ both
 
     def times(matrix, columns):
         # In this form XLA fuses the four products into one loop over the columns.

@@ -140,6 +140,7 @@ def _verdict(
     gram: Gram, hypothesis: Hypothesis, explained: float, freedom: int, tests: float
 ) -> Verdict:
     within = _within_bounds(gram, hypothesis) if freedom > 0 else 0.0
+    # An impossible hypothesis is ranked by what it would explain without bounds.
     explained = within or explained
     p = corrected(min(1.0, chance(explained, freedom) * hypothesis.tests), tests)
     price = freedom * np.log(gram.count) + 2 * np.log(hypothesis.tests)
@@ -159,9 +160,8 @@ def _within_bounds(gram: Gram, hypothesis: Hypothesis) -> float:
     A negative drag, for example, is not possible.
     """
     at = list(hypothesis.columns)
-    size = gram.size[at]
-    limits = np.array(hypothesis.lower) * size, np.array(hypothesis.upper) * size
-    return bounded_amplitudes(gram.gram[np.ix_(at, at)], gram.score[at], limits)[1]
+    limits, inner = (hypothesis.lower, hypothesis.upper), gram.gram[np.ix_(at, at)]
+    return bounded_amplitudes(inner, gram.score[at], gram.size[at], limits)[1]
 
 
 def _floor(

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 from collections.abc import Iterator
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -104,12 +103,13 @@ def _left(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " joint
 
     filtering = Filtering()
     try:
-        motions = [filtered(r, filtering.on(r)) for r in recordings]
+        settled = [filtering.on(r) for r in recordings]
+        motions = [filtered(r, own) for r, own in zip(recordings, settled, strict=True)]
         stacked = stack(loop, recordings, filtering, motions)
         chosen = linear_parameters(loop)
     except JaxidError:
         return None
-    reduce = [decimator(r, filtering.on(r)) for r in recordings]
+    reduce = [decimator(r, own) for r, own in zip(recordings, settled, strict=True)]
     q, tau = (
         np.concatenate([to(getattr(m, x)) for to, m in zip(reduce, motions, strict=True)])
         for x in ("q", "tau")
@@ -193,10 +193,11 @@ def _at_speeds(loop: ClosedLoop, factors: Float[np.ndarray, " joints"]) -> Close
     """
     chosen, values = [], []
     for p in loop.parameters:
-        if p.place[0] == "effects" and p.place[2:] == ("smoothing",):
-            effect: Any = loop.effects[int(p.place[1])]
+        if p.place[0] == "effects" and p.place[2:] == ("smoothing",) and p.size == 1:
+            # An effect that a user wrote may have no joint.
+            joint = getattr(loop.effects[int(p.place[1])], "joint", None)
             chosen.append(p)
-            values.append(float(effect.smoothing) * factors[effect.joint - 1])
+            values.append(float(p.where(loop)) * (1.0 if joint is None else factors[joint - 1]))
     return write_values(loop, tuple(chosen), jnp.asarray(values)) if chosen else loop
 
 
