@@ -56,45 +56,94 @@ def set_loop_threshold() -> None:
 
 
 def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """`equinox.filter_jit`, with XLA options for the CPU that shorten compilation.
+    """`jax.jit` for any arguments, with XLA options for the CPU that shorten compilation.
 
     Programs then compile in less time and run as fast (docs/process.md has numbers). An option
     that the user's `XLA_FLAGS` set is left unchanged; accelerators get none. A call inside another
     program, or under a transformation such as `jax.grad`, is compiled with the options of the
     surrounding program, since JAX refuses options there.
 
+    Only the `_KEPT` programs that were used last are kept. `equinox.filter_jit` and `jax.jit` keep
+    all programs of a function: 400 MB for each robot of a long session.
+
     **Arguments:**
 
     - `fun`: a pure function; arrays are traced, everything else is static. So are the arrays of
       fields that a class names in `constants`: what is known of them shortens the program.
     """
-
-    def with_arrays(leaves: list[Any], structure: Any) -> _Result:
-        args, kwargs = jax.tree.unflatten(structure, map(_as_arrays, leaves))
-        return fun(*args, **kwargs)  # type: ignore[reportCallIssue]
-
-    # By which profiles and caches of compiled programs call it.
-    with_arrays.__name__ = with_arrays.__qualname__ = fun.__name__
-
-    # Made at the first call: two dozen such functions would noticeably slow down `import jaxid`.
-    @functools.cache
-    def jitted(outermost: bool) -> Callable[[list[Any], Any], _Result]:
-        options = _options() if outermost else {}
-        given: dict[str, Any] = {"compiler_options": options} if options else {}
-        return eqx.filter_jit(with_arrays, **given)
-
-    once = _Once()
+    program = functools.lru_cache(_KEPT)(functools.partial(_Program, fun))
+    making = threading.Lock()
 
     @functools.wraps(fun)
     def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        leaves, structure = jax.tree.flatten((args, kwargs), is_leaf=_has_constants)
-        leaves = list(map(_as_constants, leaves))
-        run = functools.partial(jitted(_nothing_is_traced()), leaves, structure)
-        if threading.current_thread() is threading.main_thread():
-            return run()
-        return once.first_alone(run, (leaves, structure))
+        outer, outside = jax.tree.flatten((args, kwargs), is_leaf=_has_constants)
+        leaves, inside = jax.tree.flatten(list(map(_as_constants, outer)))
+        arrays = [x for x in leaves if _is_array(x)]
+        static = tuple(None if _is_array(x) else x for x in leaves)
+        kinds = tuple((np.shape(x), x.dtype) if _is_array(x) else type(x) for x in leaves)
+        # Otherwise two threads could make two programs for the same arguments.
+        with making:
+            one = program(outside, inside, static, kinds, _nothing_is_traced())
+        return one(arrays)
 
     return call
+
+
+# Number of programs that each function keeps. A discovery calls a function with a few structures.
+_KEPT = 8
+
+
+class _Program:
+    """A function as a program for arguments of one structure; one thread compiles it.
+
+    **Arguments:**
+
+    - `fun`: the function.
+    - `outside`, `inside`: structures of its arguments around and within modules with constants.
+    - `static`: leaves that are not arrays, with None for each array.
+    - `kinds`: shape and type of each leaf, to distinguish programs.
+    - `outermost`: False inside another program.
+    """
+
+    def __init__(
+        self,
+        fun: Callable[..., Any],
+        outside: Any,
+        inside: Any,
+        static: tuple[Any, ...],
+        kinds: tuple[Any, ...],
+        outermost: bool,
+    ):
+        # The part of the result that is not arrays, known when the function has been traced.
+        self._rest: Any = None
+
+        def by_arrays(arrays: list[Any]) -> Any:
+            left = iter(arrays)
+            leaves = [next(left) if x is None else x for x in static]
+            modules = map(_as_arrays, jax.tree.unflatten(inside, leaves))
+            args, kwargs = jax.tree.unflatten(outside, modules)
+            found, self._rest = eqx.partition(fun(*args, **kwargs), eqx.is_array)
+            return found
+
+        # By which profiles and caches of compiled programs call it.
+        by_arrays.__name__ = by_arrays.__qualname__ = fun.__name__
+        options = _options() if outermost else {}
+        given: dict[str, Any] = {"compiler_options": options} if options else {}
+        self._jitted, self._outermost = jax.jit(by_arrays, **given), outermost
+        self._first, self._ready = threading.RLock(), False
+
+    def __call__(self, arrays: list[Any]) -> Any:
+        if self._ready:
+            found = self._jitted(arrays)
+        else:
+            with self._first:
+                found = self._jitted(arrays)
+            self._ready = True
+        return eqx.combine(jax.block_until_ready(found) if self._outermost else found, self._rest)
+
+
+def _is_array(x: Any) -> bool:
+    return isinstance(x, jax.Array | np.ndarray | np.generic)
 
 
 class _Constant:
@@ -139,31 +188,6 @@ def _with_fields(module: Any, fields: dict[str, Any]) -> Any:
     made = copy.copy(module)
     vars(made).update(fields)
     return made
-
-
-class _Once:
-    """Keeps threads that need the same program from each compiling it."""
-
-    def __init__(self) -> None:
-        self._locks: dict[Any, threading.Lock] = {}
-        self._done: set[Any] = set()
-
-    def first_alone(self, run: Callable[[], _Result], arguments: Any) -> _Result:
-        """Runs; of calls with arguments of one structure, the first runs before the others."""
-        leaves, structure = jax.tree.flatten(arguments)
-        key = (
-            structure,
-            tuple(
-                (np.shape(x), x.dtype) if eqx.is_array(x) or isinstance(x, np.ndarray) else x
-                for x in leaves
-            ),
-        )
-        if key in self._done:
-            return run()
-        with self._locks.setdefault(key, threading.Lock()):
-            result = run()
-        self._done.add(key)
-        return result
 
 
 @functools.cache

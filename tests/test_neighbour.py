@@ -205,6 +205,29 @@ def test_options_that_this_version_of_xla_lacks_are_left_out(monkeypatch):
     }
 
 
+def test_only_the_programs_that_were_used_last_are_kept():
+    """A long session with many robots must not keep the programs of all of them."""
+    traced = []
+
+    @compiled
+    def total(x, name):
+        traced.append((x.shape, name))
+        return jnp.sum(x), name
+
+    for size in range(1, compiling._KEPT + 1):
+        value, name = total(np.ones(size), "a")
+        assert (float(value), name) == (size, "a")
+    assert float(total(np.ones(1), "a")[0]) == 1.0
+    assert len(traced) == compiling._KEPT
+    # Another static argument is another program, for which that of size 2 is given up.
+    assert total(np.ones(1), "b")[1] == "b"
+    total(np.ones(1), "a")
+    assert len(traced) == compiling._KEPT + 1
+    total(np.ones(2), "a")
+    assert traced[-1] == ((2,), "a")
+    assert len(traced) == compiling._KEPT + 2
+
+
 def test_compiled_functions_work_inside_other_programs():
     """JAX refuses options of a program that is called inside another one."""
     cube = compiled(lambda x: x**3)

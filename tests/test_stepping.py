@@ -26,7 +26,10 @@ import jaxid
 from jaxid.control import PD, Sampled
 from jaxid.errors import JaxidWarning, ModelError
 from jaxid.simulation.stepping import RK4
-from jaxid.simulation.steps import fastest_rate, with_substeps
+from jaxid.simulation.steps import fastest_rate, set_substeps, sharpest, with_substeps
+
+# Smoothing of a sign at the start of a fit, rad/s.
+EPS = 0.02
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +162,33 @@ def test_more_steps_where_the_loop_is_quicker(lengths):
         with_substeps(quick.with_values(eps2=1e-7), recordings)
     chosen = dataclasses.replace(slow, stepping=jaxid.Stepping(substeps=3))
     assert with_substeps(chosen, recordings).stepping.substeps == 3
+
+
+def test_friction_that_starts_at_zero_limits_its_smoothing(lengths):
+    """Otherwise a fit may reach a sign that no step resolves, along which derivatives diverge."""
+    recordings = jaxid.Recordings.of(lengths)
+    frictionless = jaxid.scara().with_values(**{**SCARA_VALUES, "Fc1": 0.0, "Fc2": 0.0})
+    frictionless = frictionless.with_values(eps2=EPS).free("eps2")
+    loop = with_substeps(frictionless, recordings)
+    factor = sharpest(loop, recordings)
+    level = 0.1 * np.sqrt(np.mean(np.concatenate([r.tau[:, 1] for r in recordings]) ** 2))
+    least = factor * EPS
+    step = 0.01 / loop.stepping.substeps
+    # RK4 is stable up to 2.8 over the rate, 2/pi Fc/eps over the inertia of joint 2.
+    assert step * level * 2 / math.pi / least / 0.06 < 2.8
+
+
+def test_a_start_that_is_stiffer_than_the_optimum_costs_no_steps_afterwards():
+    record = recorded(plain())
+    start = jaxid.scara().with_values(**SCARA_VALUES, eps2=1e-3).free("eps2")
+    before = with_substeps(start, jaxid.Recordings.of(record)).stepping.substeps
+    fit = jaxid.fit(start, record, method=jaxid.OEM(start="given", progress=False))
+    after = fit.loop.stepping.substeps
+    assert fit.table()["value"]["eps2"] > 5e-3
+    assert 2 * after <= before
+    fine = set_substeps(fit.loop, 4 * before)
+    (coarse,), (exact,) = jaxid.simulate(fit.loop, record), jaxid.simulate(fine, record)
+    assert relative(coarse.tau, exact.tau).max() < 1.1e-4
 
 
 def test_long_intervals_are_filled_up():

@@ -12,7 +12,7 @@ import jaxid
 from jaxid.control import Sampled
 from jaxid.discovery.models import Model
 from jaxid.discovery.remarks import looks_sampled
-from jaxid.discovery.verdict import _power, _spread, _through, refuted, undecided
+from jaxid.discovery.verdict import _power, _spread, _through, on_unseen, refuted, undecided
 from jaxid.discovery.verify import Refits
 from jaxid.effects import Spring, TimeDelay, TorqueOffset, TorqueRipple
 from jaxid.noise import ARFilter
@@ -66,6 +66,20 @@ def test_an_addition_that_raises_the_held_out_error_is_refuted(found):
     first, last = found.steps[0].held_out, found.steps[-1].held_out
     said = asked(found, both=(last, first))
     assert "raised the error of joint" in said
+
+
+def test_what_held_out_recordings_say_of_an_effect_is_told(found):
+    step, noise = found.steps[-1], found.diagnosis.noise
+    first, last = found.steps[0].held_out, step.held_out
+    assert step.unseen == on_unseen(first, last, noise, WORTH) == "lowers"
+    assert "confirmed by held-out recordings): " in " ".join(repr(found).split())
+    assert on_unseen(last, last, noise, WORTH) == "unchanged"
+    refuted = dataclasses.replace(step, unseen=on_unseen(last, first, noise, WORTH))
+    story = dataclasses.replace(found, steps=(found.steps[0], refuted))
+    # No probability is given beside recordings that speak against the effect.
+    assert "(refuted: raises the error on held-out recordings)" in story.sentence
+    assert "probability" not in story.sentence
+    assert story.to_dict()["added"][0]["held_out"] == "raises"
 
 
 def test_a_fit_that_failed_is_no_verdict(found):

@@ -27,7 +27,7 @@ from .search import Search
 from .step import Step
 from .story import Discovery
 from .text import joined
-from .verdict import Outcome, explains_little, misfit_of, refuted, risen, undecided
+from .verdict import Outcome, explains_little, misfit_of, on_unseen, refuted, risen, undecided
 
 _STOPPED = "the search was interrupted; resume=... continues it from its saved steps"
 # Smallest weight of a model whose error on held-out recordings is computed.
@@ -131,7 +131,7 @@ def _told(
 ) -> Discovery:
     """The result of a search, with errors on held-out recordings."""
     models = search.visited.weighed(search.at)
-    steps = _steps(search, models)
+    steps = _tested(search, _steps(search, models))
     models = _held_out(search, models, steps)
     reason = _STOPPED if interrupted else _raised(search, steps)
     if not unfinished and not reason:
@@ -174,17 +174,28 @@ def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step], models: Sequ
     return refutation or undecided(models, search.at, alike)
 
 
+def _tested(search: Search, steps: Sequence[Step]) -> list[Step]:
+    """The steps, each with what its effect does to the error on held-out recordings."""
+    found = list(steps[:1])
+    for before, step in itertools.pairwise(steps):
+        if before.held_out is not None and step.held_out is not None:
+            noise, worth = search.at.noise, search.asked.worth
+            unseen = on_unseen(before.held_out, step.held_out, noise, worth)
+            step = dataclasses.replace(step, unseen=unseen)
+        found.append(step)
+    return found
+
+
 def _raised(search: Search, steps: Sequence[Step]) -> str:
     """A reason that names the effects that raised the held-out error; empty if none did."""
-    seen = [(s.label, s.held_out) for s in steps if s.held_out is not None]
+    seen = [s.held_out for s in steps if s.held_out is not None]
     noise, worth = search.at.noise, search.asked.worth
-    if len(seen) < 2 or not (reason := risen(seen[0][1], seen[-1][1], noise, worth)):
+    if len(seen) < 2 or not (reason := risen(seen[0], seen[-1], noise, worth)):
         return ""
-    pairs = itertools.pairwise(seen)
-    culprits = [label for (_, one), (label, other) in pairs if risen(one, other, noise, worth)]
+    culprits = [s for s in steps if s.unseen == "raises"]
     # The names of all added effects would not add to the reason.
     some = 0 < len(culprits) < len(seen) - 1
-    said = f"; it rose with {joined([x.removeprefix('+ ') for x in culprits])}"
+    said = f"; it rose with {joined([s.label.removeprefix('+ ') for s in culprits])}"
     return reason + said * some
 
 

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import numpy as np
@@ -20,12 +20,17 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+# What an added effect does to the error on held-out recordings.
+OnUnseen = Literal["lowers", "raises", "unchanged"]
+
+
 class Step(eqx.Module):
     """The model with one more of the added effects.
 
     `diagnosis` exists if the search continued from this model, and for the first and last step.
     `added` is the effect that this step adds to the previous one; `probability` is the weight of
-    all models with it; `alike` are effects that these recordings cannot distinguish from it.
+    all models with it; `alike` are effects that these recordings cannot distinguish from it;
+    `unseen` tells what it does to the error on held-out recordings, None without such recordings.
     """
 
     label: str
@@ -35,6 +40,22 @@ class Step(eqx.Module):
     added: AbstractEffect | None = None
     alike: tuple[tuple[str, int | None], ...] = ()
     probability: float = 1.0
+    unseen: OnUnseen | None = eqx.field(static=True, default=None)
+
+    def belief(self, tested: bool = True) -> str:
+        """How far the effect can be believed, in words.
+
+        The probability depends on the fitted recordings only, and on the assumption that one of
+        the examined models is right. It is not given for an effect that held-out recordings refute.
+
+        **Arguments:**
+
+        - `tested`: also tell if held-out recordings confirm the effect.
+        """
+        if self.unseen == "raises":
+            return "refuted: raises the error on held-out recordings"
+        confirmed = ", confirmed by held-out recordings" if self.unseen == "lowers" else ""
+        return f"probability {odds(self.probability)}{confirmed * tested}"
 
 
 def odds(share: float) -> str:
@@ -45,13 +66,13 @@ def odds(share: float) -> str:
 
 
 def added_in_words(steps: Sequence[Step], sure: bool = True) -> list[str]:
-    """Added effects in words, with their probabilities if `sure`; repeated ones are named once."""
-    added = [(step.added, step.probability) for step in steps if step.added is not None]
+    """Added effects in words, if `sure` with how far to believe them; repeated ones once."""
+    added = [(step.added, step.belief(False)) for step in steps if step.added is not None]
     counted = Counter(_placed(e.spoken(), e) for e, _ in added)
-    shares = {_placed(e.spoken(), e): odds(share) for e, share in added}
+    beliefs = {_placed(e.spoken(), e): said for e, said in added}
     often = {1: "", 2: " twice"}
     return [
-        f"{name}{often.get(n, f' {n} times')}{f' (probability {shares[name]})' * sure}"
+        f"{name}{often.get(n, f' {n} times')}{f' ({beliefs[name]})' * sure}"
         for name, n in counted.items()
     ]
 

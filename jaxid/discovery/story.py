@@ -330,6 +330,7 @@ class Discovery(AbstractShown):
                     "recordings": list(getattr(step.added, "recordings", ())),
                     "parameters": found_parameters(self.steps, k),
                     "probability": step.probability,
+                    "held_out": step.unseen,
                     "indistinguishable": [{"effect": n, "joint": j} for n, j in step.alike],
                 }
                 for k, step in enumerate(s for s in self.steps if s.added is not None)
@@ -377,8 +378,7 @@ class Discovery(AbstractShown):
                 + f" {p['unit']}"
                 for n, p in values.items()
             )
-            sure = f" (probability {odds(step.probability)})"
-            lines.append(f"{step_name(step)}{sure}: {shown}")
+            lines.append(f"{step_name(step)} ({step.belief()}): {shown}")
             if step.alike:
                 others = ", ".join(effect_on(n, j) for n, j in step.alike)
                 lines.append(f"these recordings cannot distinguish {step_name(step)} from {others}")

@@ -18,6 +18,7 @@ from .floor import SPOKEN, Floor, floor_of
 from .hypotheses import effect_on
 from .models import LIKELY, Model, Named, probability
 from .score import spanned
+from .step import OnUnseen
 from .system import System
 
 Outcome = Literal["adequate", "explained", "outside_catalogue", "undetermined"]
@@ -261,6 +262,18 @@ def risen(before: Comparison, after: Comparison, noise: Sequence[ARFilter], wort
                 "like the held-out ones"
             )
     return ""
+
+
+def on_unseen(
+    before: Comparison, after: Comparison, noise: Sequence[ARFilter], worth: float
+) -> OnUnseen:
+    """Whether an added effect lowers or raises the error on held-out recordings.
+
+    **Arguments:** as for `risen`.
+    """
+    if risen(before, after, noise, worth):
+        return "raises"
+    return "lowers" if risen(after, before, noise, worth) else "unchanged"
 
 
 def _through(filt: ARFilter, x: Float[np.ndarray, " samples"]) -> float:

@@ -18,7 +18,7 @@ from ..simulation.batch import Batch, prepare
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate_batch
 from ..simulation.sharing import taken
-from ..simulation.steps import MANY, refined, set_substeps, sharpest
+from ..simulation.steps import MANY, refined, set_substeps, sharpest, with_substeps
 from .covariance import Optimum
 from .minimise import Minimum, Point, Problem, Stopping, minimise, reweighted
 from .pieces import (
@@ -193,34 +193,73 @@ def _new_weights(
 _FLOOR = 1e-10
 
 
-def finer_substeps(done: Converged) -> int | None:
+def finer_substeps(done: Converged, before: float = np.inf) -> tuple[int | None, float]:
     """A finer number of substeps, if halving the step moves the torque by more than 1e-4.
 
     None for a model that explains nothing: its values are meaningless, and may need any number.
+    None also if the last refinement did not reduce the change: encoders in the loop that round
+    differently cause a change that no step removes.
+
+    **Arguments:**
+
+    - `before`: relative change of the torque before the last refinement.
+
+    **Returns:** the number, and the relative change of the torque; infinite if it is not known.
     """
     if not done.minimum.status.simulated or done.loop.stepping.control is not None:
-        return None
+        return None, np.inf
     if isinstance(done.loop.controller, OpenLoop) or _explains_nothing(done):
-        return None
-    now, batch = done.loop.stepping.substeps or 1, done.batch
+        return None, np.inf
+    now = done.loop.stepping.substeps or 1
     if _at_its_sharpest(done):
         # A sign that changes at once has no step that is small enough.
-        return 4 * now if 4 * now <= MANY else None
+        return (4 * now if 4 * now <= MANY else None), np.inf
+    error = _moved(done, now, 2 * now)
+    if not np.isfinite(error) or error <= _ACCURATE or error > _FELL * before:
+        return None, error
+    # A method of order p leaves 2⁻ᵖ of its error at half the step.
+    power = 1.2 / (done.loop.stepping.solver.order(None) or 1)
+    return refined(now * (error / _ACCURATE) ** power + 1, done.loop.name), error
+
+
+def fewer_substeps(done: Converged, recordings: Recordings, least: float) -> int | None:
+    """At most half as many substeps, if they move the torque by at most 1e-4; otherwise None.
+
+    Start values may be stiffer than the optimum, and need more steps.
+
+    **Arguments:**
+
+    - `least`: relative change of the torque that no step removes.
+    """
+    stepping = done.loop.stepping
+    simulated = done.minimum.status.simulated and not isinstance(done.loop.controller, OpenLoop)
+    if not simulated or not stepping.settled or stepping.substeps is None or _at_its_sharpest(done):
+        return None
+    fewer = with_substeps(set_substeps(done.loop, None), recordings).stepping.substeps
+    if fewer is None or 2 * fewer > stepping.substeps:
+        return None
+    return fewer if _moved(done, fewer, stepping.substeps) <= max(_ACCURATE, least) else None
+
+
+def _moved(done: Converged, one: int, other: int) -> float:
+    """Largest relative change of a joint's torque between two numbers of substeps."""
+    batch = done.batch
     # Few recordings use the program that is already compiled; of many recordings, one is enough.
     if len(done.pieces) > 4:
         shortest = int(np.argmin([piece.samples for piece in done.pieces]))
         batch = taken(batch, np.array([shortest]))
-    runs = [simulate_batch(set_substeps(done.loop, k), batch).tau for k in (now, 2 * now)]
+    runs = [simulate_batch(set_substeps(done.loop, k), batch).tau for k in (one, other)]
     coarse, fine = map(batch.compared, runs)
     there = np.asarray(batch.kept)
     coarse, fine = np.asarray(coarse)[there], np.asarray(fine)[there]
     size = np.linalg.norm(fine, axis=0)
-    error = np.linalg.norm(coarse - fine, axis=0) / np.where(size > 0, size, 1.0)
-    if not np.isfinite(error).all() or error.max() <= 1e-4:
-        return None
-    # A method of order p leaves 2⁻ᵖ of its error at half the step.
-    power = 1.2 / (done.loop.stepping.solver.order(None) or 1)
-    return refined(now * (error.max() / 1e-4) ** power + 1, done.loop.name)
+    return float(np.max(np.linalg.norm(coarse - fine, axis=0) / np.where(size > 0, size, 1.0)))
+
+
+# Largest relative change of the torque by the length of the steps.
+_ACCURATE = 1e-4
+# Largest ratio of that change after a refinement to that before.
+_FELL = 0.9
 
 
 def residual_series(done: Converged) -> list[np.ndarray]:

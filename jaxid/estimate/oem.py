@@ -19,7 +19,7 @@ from ..simulation.batch import Batch, prepare
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate
 from ..simulation.steps import set_substeps, with_substeps
-from .converge import Converged, converge, finer_substeps
+from .converge import Converged, converge, fewer_substeps, finer_substeps
 from .covariance import Deviations
 from .minimise import check_solver
 from .pieces import Output, compared_signals, pieces_of
@@ -95,8 +95,9 @@ class OEM(AbstractMethod):
                 kept = _without_diverging(done.loop, recordings)
             if len(kept) < len(recordings):
                 done = self._from_start(loop, kept, say, deadline)
+            error = math.inf
             for _ in range(_REFINED):
-                finer = finer_substeps(done)
+                finer, error = finer_substeps(done, error)
                 if finer is None or time.perf_counter() > deadline:
                     break
                 say(f"again with {finer} steps between samples")
@@ -107,6 +108,10 @@ class OEM(AbstractMethod):
                 if not again.minimum.status.simulated:
                     break
                 done = again
+            fewer = fewer_substeps(done, kept, error if math.isfinite(error) else 0.0)
+            if fewer is not None:
+                coarser = set_substeps(done.loop, fewer, settled=True)
+                done = dataclasses.replace(done, loop=coarser)
         seconds = time.perf_counter() - started
         found = report(self.deviations, done, kept, seconds, self)
         more = (*_left_out(recordings, kept), *self._forgotten(loop))

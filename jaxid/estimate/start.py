@@ -12,7 +12,7 @@ from ..recording import Recordings
 from ..simulation.batch import Batch, prepare
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate_batch
-from ..simulation.steps import with_substeps
+from ..simulation.steps import MANY, with_substeps
 from .didim import DIDIM, physical
 from .idim import IDIM
 
@@ -46,7 +46,7 @@ def start_values(
             continue
         if np.isfinite(theta).all():
             candidates.append(physical(loop, theta))
-            most = _STIFFER * _steps(loop, recordings)
+            most = max(_STIFFER * _steps(loop, recordings), MANY)
             errors.append(_simulated_error(candidates[-1], recordings, batch, most))
         if min(errors) < _NEAR:
             break
@@ -66,7 +66,8 @@ def _by_didim(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " l
 # Share of the squared torque, mean over joints, below which no better start is needed.
 _NEAR = 0.2**2
 # Steps of a start over those of the loop as it is, above which an inertia is almost zero: of
-# recordings with a mistake in them, whose fit would take an hour for each of its steps.
+# recordings with a mistake in them, whose fit would take an hour for each of its steps. A loop
+# without friction needs few steps, so `MANY` are always allowed.
 _STIFFER = 10
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from ..discovery import Discovery
 from ..discovery.hypotheses import effect_on
-from ..discovery.step import Step, odds
+from ..discovery.step import Step
 from ..discovery.text import capitalised
 from ._html import Markup, anchor, join, link, section, tag, with_deviation
 
@@ -96,7 +96,8 @@ def values(story: Discovery) -> Markup | None:
         shown = "; ".join(_value(name, **p) for name, p in entry["parameters"].items())
         name = _name(step)
         title = tag("b", capitalised(name))
-        sure = f"probability\u00a0{odds(step.probability)}".replace(" ", "\u00a0")
+        share, *tested = step.belief().split(", ")
+        sure = ", ".join([share.replace(" ", "\u00a0"), *tested])
         lines.append(tag("li", join(title, f" ({sure}): {shown}")))
     return tag("ul", *lines, class_="found") if lines else None
 

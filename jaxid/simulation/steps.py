@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ..compiling import compiled
 from ..control import Reading, Reference
-from ..effects import NOBODY
+from ..effects import NOBODY, Coulomb
 from ..errors import JaxidWarning, ModelError
 from ..recording import Recordings
 from .batch import check_joints, held_at, held_names
@@ -168,6 +168,8 @@ def fastest_rate(loop: ClosedLoop, recordings: Recordings) -> float:
 _STABLE = 2.5
 # By how much smoothings are reduced at a time, and how often at most.
 _SHARPER, _TIMES = 1.5, 30
+# Smallest dry friction for which steps have to be stable, as a share of the torque.
+_FRICTION = 0.1
 
 
 def sharpest(loop: ClosedLoop, recordings: Recordings) -> float:
@@ -188,14 +190,30 @@ def sharpest(loop: ClosedLoop, recordings: Recordings) -> float:
     period = loop.controller.period
     longest = max(r.period for r in recordings)
     step = (longest if period is None else min(longest, period)) / (stepping.substeps or 1)
-    factor = 1.0
+    factor, levels = 1.0, _levels(loop, recordings)
     for _ in range(_TIMES):
         sharper = factor / _SHARPER
-        values = {p.name: sharper * float(p.where(loop)) for p in signs}
+        values = levels | {p.name: sharper * float(p.where(loop)) for p in signs}
         if fastest_rate(loop.with_values(**values), recordings) * step > _STABLE:
             break
         factor = sharper
     return factor
+
+
+def _levels(loop: ClosedLoop, recordings: Recordings) -> dict[str, float]:
+    """Estimated levels of dry friction, by name, each at least a share of its joint's torque.
+
+    A level of zero, from which an estimate may start, would allow any smoothing.
+    """
+    tau = np.concatenate([r.tau for r in recordings])
+    least = _FRICTION * np.sqrt(np.mean(tau**2, axis=0))
+    return {
+        p.name: max(float(p.where(loop)), float(least[effect.joint - 1]))
+        for k, effect in enumerate(loop.effects)
+        if isinstance(effect, Coulomb)
+        for p in loop.free_parameters
+        if p.place == ("effects", k, "level")
+    }
 
 
 def _rates(loop: ClosedLoop, recordings: Recordings) -> tuple[float, float]:
