@@ -11,6 +11,13 @@ from .models import Model
 # Smallest relevant effect if the law is unknown, as a share of the residual: filters on motion and
 # torque, ticks and stiction cause errors of this size even in good recordings.
 _BLURRED = 0.25
+# A model may leave an error of 1.3 times the noise floor for these reasons, so a free-form curve
+# must lower the error by this factor, and by this much of the torque, %, to count as a missing
+# physical effect.
+BLURRED, BLUR = 1.30, 0.2
+# Share of the residual's power above the noise that effects must explain, if a curve has a better
+# score.
+_AS_MUCH = 0.9
 
 
 def matters(at: Model, c: Candidate, plain: Candidate, worth: float) -> bool:
@@ -29,7 +36,32 @@ def matters(at: Model, c: Candidate, plain: Candidate, worth: float) -> bool:
     left = np.linalg.norm(np.concatenate(at.fit.residuals), axis=0)
     changed = np.linalg.norm((c.rest - plain.rest).reshape(-1, c.rest.shape[-1]), axis=0)
     percent = over_recordings(at.fit.error_percent.to_numpy())
-    return bool(np.any(changed * percent > _least(at, percent, worth) * left))
+    least = _least(at, percent, worth)
+    if c.curve is not None and imposed(at.fit.loop):
+        least = np.maximum(max(worth, BLUR), np.sqrt(1 - 1 / BLURRED**2) * percent)
+    return bool(np.any(changed * percent > least * left))
+
+
+def follows(
+    before: Float[np.ndarray, " joints"] | None,
+    effects: Float[np.ndarray, " joints"] | None,
+    curve: Float[np.ndarray, " joints"] | None,
+    floor: Float[np.ndarray, " joints"],
+) -> bool:
+    """Whether effects explain most of the residual of the joint of a curve.
+
+    Then they are not mere approximations of the curve, although it may have a better score. If the
+    noise is low, the score compares what is left after both, which can be due to filters, ticks
+    and stiction.
+
+    **Arguments:** relative errors by joint, %, before, with the effects and with the curve, and
+    that of noise.
+    """
+    if before is None or effects is None or curve is None:
+        return False
+    joint = int(np.argmax(before**2 - curve**2))
+    explained = before**2 - np.minimum(curve, floor) ** 2
+    return bool(before[joint] ** 2 - effects[joint] ** 2 >= _AS_MUCH * explained[joint])
 
 
 def loses(less: Model, at: Model, worth: float) -> bool:

@@ -26,7 +26,7 @@ from .models import LIKELY, Model, Named, Visited, listed
 from .predict import Predictor
 from .ranking import Screened, judge
 from .release import released
-from .relevance import loses, matters
+from .relevance import follows, loses, matters
 from .screening import carried, screen
 from .support import unsupported
 from .system import System
@@ -222,11 +222,22 @@ class Search:
         full = len(at.effects) >= self.asked.most
         tried = [] if full else self._to_fit(plain, nothing)
         # Effects that explain much less than one curve only approximate the curve.
-        alone = [c.score for c in candidates if c.curve is not None and not c.effects]
-        gain = nothing - min(alone, default=np.inf)
+        alone = [c for c in candidates if c.curve is not None and not c.effects]
+        curve = min(alone, key=lambda c: c.score, default=None)
+        gain = nothing - (np.inf if curve is None else curve.score)
         limit = at.score - max(gain - max(DECISIVE, _INEXACT * gain), LIKELY)
+        by_curve = None if curve is None else self._left_by(curve)
+        floor = self.diagnoses[at.key].floor_percent()
         found = [(m, c) for c in tried if (m := self._fitted(at, c, nothing - c.score)) is not None]
-        better = [pair for pair in found if pair[0].score < limit]
+        better = [
+            pair
+            for pair in found
+            if pair[0].score < limit
+            or (
+                pair[0].score < at.score - LIKELY
+                and follows(at.left, pair[0].left, by_curve, floor)
+            )
+        ]
         best = min(better, key=lambda pair: pair[0].score, default=None)
         anchor = at.score - nothing if best is None else best[0].score - best[1].score
         self.visited.add_predicted(candidates, at, anchor, self._left_by)
@@ -394,8 +405,11 @@ class Search:
             lambda m: m.curve is not None and set(key_of(m.effects)) < mine
         )
         if rivals and rivals[0].score < self.at.score - DECISIVE:
-            self.at = self._part(rivals[0].effects)
-            return "outside_catalogue", False
+            part = self._part(rivals[0].effects)
+            floor = self.diagnoses[self.at.key].floor_percent()
+            if not follows(part.left, self.at.left, rivals[0].left, floor):
+                self.at = part
+                return "outside_catalogue", False
         if curved and curved[0].score == min(c.score for c in candidates):
             return "outside_catalogue", False
         left = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]

@@ -17,6 +17,7 @@ from .explore import DECISIVE
 from .floor import SPOKEN, Floor, floor_of
 from .hypotheses import effect_on
 from .models import LIKELY, Model, Named, probability
+from .relevance import BLUR, BLURRED
 from .score import spanned
 from .step import OnUnseen
 from .system import System
@@ -26,9 +27,6 @@ Outcome = Literal["adequate", "explained", "outside_catalogue", "undetermined"]
 # Ratio of the error to that of noise above which a model is rejected. The noise of recordings of
 # one arm differs by a few per cent; an error that is a tenth larger is visible in a figure.
 _REFUTED = 1.10
-# The same ratio if the law is unknown, and the smallest relevant excess, in % of the torque.
-# Filters on both signals, the ticks of the law and stiction cause errors of this size.
-_BLURRED, _BLUR = 1.30, 0.2
 # Smallest significant excess, in standard deviations.
 _SURE = 4.0
 # Ratio of the residual's power to that of its innovations above which it is not white noise.
@@ -206,9 +204,10 @@ def _above_floor(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
         return ""
     left = over_recordings(fit.error_percent.to_numpy())
     by_noise = diagnosis.floor_percent()
-    ratio = np.where(left**2 - by_noise**2 > worth**2, left / np.maximum(by_noise, 1e-12), 0.0)
+    limit, least = (BLURRED, max(worth, BLUR)) if imposed(fit.loop) else (_REFUTED, worth)
+    ratio = np.where(left**2 - by_noise**2 > least**2, left / np.maximum(by_noise, 1e-12), 0.0)
     worst = int(np.argmax(ratio))
-    if not ratio[worst] > _REFUTED:
+    if not ratio[worst] > limit:
         return ""
     label = joint_columns(fit.loop.joints)[worst]
     return (
@@ -223,7 +222,7 @@ def _above_measured(fit: Fit | Comparison, floor: Floor | None, worth: float) ->
     if floor is None:
         return ""
     left = fit.error_percent.to_numpy()
-    limit, least = (_BLURRED, max(worth, _BLUR)) if imposed(fit.loop) else (_REFUTED, worth)
+    limit, least = (BLURRED, max(worth, BLUR)) if imposed(fit.loop) else (_REFUTED, worth)
     matters = left**2 - np.nan_to_num(floor.percent) ** 2 > least**2
     ratio = np.where(matters & (left > limit * floor.high), left / floor.percent, 0.0)
     if not np.any(ratio > limit):

@@ -1,0 +1,41 @@
+"""Which effects and curves are worth adding."""
+
+import numpy as np
+import pytest
+
+from jaxid.discovery.relevance import follows
+
+FLOOR = np.array([0.3, 0.5])
+BEFORE = np.array([0.3, 2.4])
+
+
+def left(joint: float) -> np.ndarray:
+    return np.array([0.3, joint])
+
+
+@pytest.mark.parametrize(
+    ("effects", "curve", "expected"),
+    [
+        # A curve that reaches the noise floor, and an effect that nearly does.
+        (0.6, 0.5, True),
+        (1.2, 0.5, False),
+        # A curve too coarse for what is missing does not make a coarse effect right.
+        (1.2, 1.3, False),
+        # A curve may be better than the estimated floor.
+        (0.85, 0.5, True),
+        (0.85, 0.1, False),
+    ],
+)
+def test_effects_that_explain_as_much_as_a_curve_are_no_approximation(effects, curve, expected):
+    assert follows(BEFORE, left(effects), left(curve), FLOOR) is expected
+
+
+def test_only_the_joint_of_the_curve_counts():
+    other = np.array([0.1, 2.4])
+    assert not follows(BEFORE, other, left(0.5), FLOOR)
+
+
+def test_errors_that_are_not_known_show_nothing():
+    assert not follows(None, left(0.5), left(0.5), FLOOR)
+    assert not follows(BEFORE, None, left(0.5), FLOOR)
+    assert not follows(BEFORE, left(0.5), None, FLOOR)
