@@ -310,18 +310,33 @@ def test_a_load_that_drives_the_axis_into_its_limit_is_found():
     assert found.loop.effects[-1].recordings == load.recordings
 
 
-def test_an_effect_that_a_curve_replaces_is_not_part_of_the_answer():
+@pytest.mark.parametrize("left", [None, 3.0, 1.1])
+def test_an_effect_that_a_curve_replaces_is_not_part_of_the_answer(left):
     """The best model is a curve with one of two effects: the answer has that effect only, even if
-    it was never fitted alone.
+    it was never fitted alone, unless the other effect explains as much as the curve.
     """
     spring, stribeck = Spring(joint=1), Stribeck(joint=2)
     search = object.__new__(Search)
     search.asked = SimpleNamespace(most=5)
-    search.at, search.visited = Model((spring, stribeck), score=-50.0), Visited()
+    errors = [None if left is None else np.array([0.5, x]) for x in (left, 1.0, 5.0)]
+    search.at = Model((spring, stribeck), score=-50.0, left=errors[0])
+    search.visited = Visited()
+    noise = SimpleNamespace(floor_percent=lambda: np.array([0.5, 1.0]))
+    search.diagnoses = {search.at.key: noise}
     curve = jaxid.effects.Curve(joint=2, coordinate="tau", of=2)
-    search.visited.add(Model((Spring(joint=1, stiffness=3.0),), score=-90.0, curve=curve, beyond=2))
+    alone = Model((Spring(joint=1, stiffness=3.0),), score=-90.0, curve=curve, beyond=2)
+    search.visited.add(dataclasses.replace(alone, left=errors[1]))
     asked = []
-    search.refitted = lambda at, effects: asked.append(effects) or Model(tuple(effects), -30.0)
+
+    def refitted(at, effects):
+        asked.append(effects)
+        return Model(tuple(effects), -30.0, left=errors[2])
+
+    search.refitted = refitted
+    if left == 1.1:
+        assert search._verdict([], 0.0) == ("explained", False)
+        assert len(search.at.effects) == 2
+        return
     assert search._verdict([], 0.0) == ("outside_catalogue", False)
     assert asked == [[spring]]
     assert search.at.effects[0] is spring
