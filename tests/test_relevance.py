@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxid.discovery.relevance import follows
+from jaxid.discovery.relevance import matches_curve
 
 FLOOR = np.array([0.3, 0.5])
 BEFORE = np.array([0.3, 2.4])
@@ -27,15 +27,15 @@ def left(joint: float) -> np.ndarray:
     ],
 )
 def test_effects_that_explain_as_much_as_a_curve_are_no_approximation(effects, curve, expected):
-    assert follows(BEFORE, left(effects), left(curve), FLOOR) is expected
+    assert matches_curve(BEFORE, left(effects), left(curve), FLOOR) is expected
 
 
 def test_only_the_joint_of_the_curve_counts():
     other = np.array([0.1, 2.4])
-    assert not follows(BEFORE, other, left(0.5), FLOOR)
+    assert not matches_curve(BEFORE, other, left(0.5), FLOOR)
 
 
 def test_errors_that_are_not_known_show_nothing():
-    assert not follows(None, left(0.5), left(0.5), FLOOR)
-    assert not follows(BEFORE, None, left(0.5), FLOOR)
-    assert not follows(BEFORE, left(0.5), None, FLOOR)
+    assert not matches_curve(None, left(0.5), left(0.5), FLOOR)
+    assert not matches_curve(BEFORE, None, left(0.5), FLOOR)
+    assert not matches_curve(BEFORE, left(0.5), None, FLOOR)

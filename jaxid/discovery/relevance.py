@@ -4,17 +4,19 @@ import numpy as np
 from jaxtyping import Float
 
 from ..simulation.dynamics import imposed
+from ..simulation.loop import ClosedLoop
 from .diagnosis import over_recordings
 from .explore import Candidate
 from .models import Model
 
 # Smallest relevant effect if the law is unknown, as a share of the residual: filters on motion and
 # torque, ticks and stiction cause errors of this size even in good recordings.
-_BLURRED = 0.25
-# A model may leave an error of 1.3 times the noise floor for these reasons, so a free-form curve
-# must lower the error by this factor, and by this much of the torque, %, to count as a missing
-# physical effect.
-BLURRED, BLUR = 1.30, 0.2
+_SMALL = 0.25
+# For these reasons an error of 1.3 times that of noise is allowed then, or an excess of 0.2 %.
+_BLURRED, _BLUR = 1.30, 0.2
+# The same ratio if the law is known. The noise of recordings of one arm differs by a few per cent;
+# an error that is a tenth larger is visible in a figure.
+REFUTED = 1.10
 # Share of the residual's power above the noise that effects must explain, if a curve has a better
 # score.
 _AS_MUCH = 0.9
@@ -38,11 +40,23 @@ def matters(at: Model, c: Candidate, plain: Candidate, worth: float) -> bool:
     percent = over_recordings(at.fit.error_percent.to_numpy())
     least = _least(at, percent, worth)
     if c.curve is not None and imposed(at.fit.loop):
-        least = np.maximum(max(worth, BLUR), np.sqrt(1 - 1 / BLURRED**2) * percent)
+        # Otherwise a curve would refute a model whose error is allowed.
+        ratio, excess = allowed(at.fit.loop, worth)
+        least = np.maximum(excess, np.sqrt(1 - 1 / ratio**2) * percent)
     return bool(np.any(changed * percent > least * left))
 
 
-def follows(
+def allowed(loop: ClosedLoop, worth: float) -> tuple[float, float]:
+    """Largest allowed ratio of an error to that of noise, and allowed excess, in % of the torque.
+
+    **Arguments:**
+
+    - `worth`: smallest relevant change of a joint's torque, %.
+    """
+    return (_BLURRED, max(worth, _BLUR)) if imposed(loop) else (REFUTED, worth)
+
+
+def matches_curve(
     before: Float[np.ndarray, " joints"] | None,
     effects: Float[np.ndarray, " joints"] | None,
     curve: Float[np.ndarray, " joints"] | None,
@@ -87,5 +101,5 @@ def _least(
     - `percent`: relative error of each joint's torque, %.
     """
     assert at.fit is not None
-    share = _BLURRED if imposed(at.fit.loop) else 0.0
+    share = _SMALL if imposed(at.fit.loop) else 0.0
     return np.maximum(worth, share * percent)

@@ -26,7 +26,7 @@ from .models import LIKELY, Model, Named, Visited, listed
 from .predict import Predictor
 from .ranking import Screened, judge
 from .release import released
-from .relevance import follows, loses, matters
+from .relevance import loses, matches_curve, matters
 from .screening import carried, screen
 from .support import unsupported
 from .system import System
@@ -235,7 +235,7 @@ class Search:
             if pair[0].score < limit
             or (
                 pair[0].score < at.score - LIKELY
-                and follows(at.left, pair[0].left, by_curve, floor)
+                and matches_curve(at.left, pair[0].left, by_curve, floor)
             )
         ]
         best = min(better, key=lambda pair: pair[0].score, default=None)
@@ -407,7 +407,7 @@ class Search:
         if rivals and rivals[0].score < self.at.score - DECISIVE:
             part = self._part(rivals[0].effects)
             floor = self.diagnoses[self.at.key].floor_percent()
-            if not follows(part.left, self.at.left, rivals[0].left, floor):
+            if not matches_curve(part.left, self.at.left, rivals[0].left, floor):
                 self.at = part
                 return "outside_catalogue", False
         if curved and curved[0].score == min(c.score for c in candidates):

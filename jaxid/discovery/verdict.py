@@ -10,23 +10,19 @@ from ..estimate import Fit, Status
 from ..estimate.mistakes import at_limit
 from ..estimate.result import DOUBTFUL_PERCENT, joint_columns
 from ..noise import ARFilter
-from ..simulation.dynamics import imposed
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
 from .explore import DECISIVE
 from .floor import SPOKEN, Floor, floor_of
 from .hypotheses import effect_on
 from .models import LIKELY, Model, Named, probability
-from .relevance import BLUR, BLURRED
+from .relevance import REFUTED, allowed
 from .score import spanned
 from .step import OnUnseen
 from .system import System
 
 Outcome = Literal["adequate", "explained", "outside_catalogue", "undetermined"]
 
-# Ratio of the error to that of noise above which a model is rejected. The noise of recordings of
-# one arm differs by a few per cent; an error that is a tenth larger is visible in a figure.
-_REFUTED = 1.10
 # Smallest significant excess, in standard deviations.
 _SURE = 4.0
 # Ratio of the residual's power to that of its innovations above which it is not white noise.
@@ -150,7 +146,7 @@ def explains_little(fit: Fit, noise: Sequence[ARFilter], measured: Floor | None)
         floor = np.nan_to_num(over_recordings(measured.high))
     joints = joint_columns(fit.loop.joints)
     for label, percent, by_noise, filt in zip(joints, left, floor, noise, strict=True):
-        large = percent > max(DOUBTFUL_PERCENT, _REFUTED * by_noise)
+        large = percent > max(DOUBTFUL_PERCENT, REFUTED * by_noise)
         if large and filt.gain > _COLOURED:
             return (
                 f"the error of {label} is {percent:.3g} %, and its residual is not white noise: "
@@ -186,7 +182,7 @@ def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
         chance = np.sqrt(sum(_through(f, x[:, o]) for o, f in pairs for x in rows))
         rest = left.reshape(rate.shape)[..., j]
         part = abs(late) * np.linalg.norm(rows[..., j]) / np.linalg.norm(rest)
-        large = part**2 > 1 - 1 / _REFUTED**2 and part * percent[j] > worth
+        large = part**2 > 1 - 1 / REFUTED**2 and part * percent[j] > worth
         if large and abs(float(own @ left)) > _SURE * chance:
             order = "before" if late > 0 else "after"
             return (
@@ -204,7 +200,7 @@ def _above_floor(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
         return ""
     left = over_recordings(fit.error_percent.to_numpy())
     by_noise = diagnosis.floor_percent()
-    limit, least = (BLURRED, max(worth, BLUR)) if imposed(fit.loop) else (_REFUTED, worth)
+    limit, least = allowed(fit.loop, worth)
     ratio = np.where(left**2 - by_noise**2 > least**2, left / np.maximum(by_noise, 1e-12), 0.0)
     worst = int(np.argmax(ratio))
     if not ratio[worst] > limit:
@@ -222,7 +218,7 @@ def _above_measured(fit: Fit | Comparison, floor: Floor | None, worth: float) ->
     if floor is None:
         return ""
     left = fit.error_percent.to_numpy()
-    limit, least = (BLURRED, max(worth, BLUR)) if imposed(fit.loop) else (_REFUTED, worth)
+    limit, least = allowed(fit.loop, worth)
     matters = left**2 - np.nan_to_num(floor.percent) ** 2 > least**2
     ratio = np.where(matters & (left > limit * floor.high), left / floor.percent, 0.0)
     if not np.any(ratio > limit):
@@ -299,12 +295,12 @@ def _above_noise(fit: Fit, held_out: Comparison, noise: Sequence[ARFilter], wort
         matters = percent**2 * (1 - 1 / np.maximum(ratio, 1.0)) > worth**2
         return np.where(matters & (ratio - 1 > _SURE * chance), np.sqrt(ratio), 0.0)
 
-    if not np.any(above(power) > _REFUTED):
+    if not np.any(above(power) > REFUTED):
         return ""
     # The linearisation along the held-out runs compiles a program, so it is made only if needed.
     expected = power + _unsure(fit, held_out)
     found = above(expected)
-    if not np.any(found > _REFUTED):
+    if not np.any(found > REFUTED):
         return ""
     r, j = np.unravel_index(int(np.argmax(found)), found.shape)
     label = joint_columns(fit.loop.joints)[j]

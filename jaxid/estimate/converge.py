@@ -18,7 +18,7 @@ from ..simulation.batch import Batch, prepare
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate_batch
 from ..simulation.sharing import taken
-from ..simulation.steps import MANY, refined, set_substeps, sharpest, with_substeps
+from ..simulation.steps import MANY, needed_substeps, refined, set_substeps, sharpest
 from .covariance import Optimum
 from .minimise import Minimum, Point, Problem, Stopping, minimise, reweighted
 from .pieces import (
@@ -235,9 +235,10 @@ def fewer_substeps(done: Converged, recordings: Recordings, least: float) -> int
     simulated = done.minimum.status.simulated and not isinstance(done.loop.controller, OpenLoop)
     if not simulated or not stepping.settled or stepping.substeps is None or _at_its_sharpest(done):
         return None
-    fewer = with_substeps(set_substeps(done.loop, None), recordings).stepping.substeps
-    if fewer is None or 2 * fewer > stepping.substeps:
+    fewer = needed_substeps(set_substeps(done.loop, None), recordings)
+    if 2 * fewer > stepping.substeps:
         return None
+    fewer = int(fewer)
     return fewer if _moved(done, fewer, stepping.substeps) <= max(_ACCURATE, least) else None
 
 

@@ -1,18 +1,17 @@
 """Start values of output error, from inverse dynamics if they are better."""
 
-import warnings
 from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
 
 from ..control import OpenLoop
-from ..errors import JaxidError, JaxidWarning, ModelError
+from ..errors import JaxidError, ModelError
 from ..recording import Recordings
 from ..simulation.batch import Batch, prepare
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate_batch
-from ..simulation.steps import MANY, with_substeps
+from ..simulation.steps import MANY, needed_substeps, with_substeps
 from .didim import DIDIM, physical
 from .idim import IDIM
 
@@ -46,7 +45,7 @@ def start_values(
             continue
         if np.isfinite(theta).all():
             candidates.append(physical(loop, theta))
-            most = max(_STIFFER * _steps(loop, recordings), MANY)
+            most = max(_STIFFER * needed_substeps(loop, recordings), MANY)
             errors.append(_simulated_error(candidates[-1], recordings, batch, most))
         if min(errors) < _NEAR:
             break
@@ -71,16 +70,6 @@ _NEAR = 0.2**2
 _STIFFER = 10
 
 
-def _steps(loop: ClosedLoop, recordings: Recordings) -> float:
-    """Steps between two samples that a loop needs; infinite if they are too many."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", JaxidWarning)
-        try:
-            return with_substeps(loop, recordings).stepping.substeps or 1
-        except ModelError:
-            return np.inf
-
-
 def _simulated_error(
     loop: ClosedLoop, recordings: Recordings, batch: Batch, most: float = np.inf
 ) -> float:
@@ -92,7 +81,7 @@ def _simulated_error(
 
     - `most`: steps between two samples; a loop that needs more counts as one that fails.
     """
-    if isinstance(loop.controller, OpenLoop) or _steps(loop, recordings) > most:
+    if isinstance(loop.controller, OpenLoop) or needed_substeps(loop, recordings) > most:
         return np.inf
     try:
         tau = simulate_batch(with_substeps(loop, recordings), batch).tau

@@ -96,8 +96,8 @@ def values(story: Discovery) -> Markup | None:
         shown = "; ".join(_value(name, **p) for name, p in entry["parameters"].items())
         name = _name(step)
         title = tag("b", capitalised(name))
-        share, *tested = step.belief().split(", ")
-        sure = ", ".join([share.replace(" ", "\u00a0"), *tested])
+        # A number stays with its sign.
+        sure = step.belief().replace("> ", ">\u00a0").replace("< ", "<\u00a0")
         lines.append(tag("li", join(title, f" ({sure}): {shown}")))
     return tag("ul", *lines, class_="found") if lines else None
 

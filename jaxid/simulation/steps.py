@@ -60,6 +60,16 @@ def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     return set_substeps(loop, steps_at(rate, interval, loop.name), settled=True)
 
 
+def needed_substeps(loop: ClosedLoop, recordings: Recordings) -> float:
+    """Steps between two samples that a loop needs; infinite if they are too many. No warnings."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", JaxidWarning)
+        try:
+            return with_substeps(loop, recordings).stepping.substeps or 1
+        except ModelError:
+            return math.inf
+
+
 def steps_at(rate: float, interval: float, name: str) -> int:
     """Number of steps at a rate, 1/s, that fill an interval, s.
 
