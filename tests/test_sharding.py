@@ -104,6 +104,28 @@ def test_cores_that_share_recordings_give_the_linearisation_of_one(law, monkeypa
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.max(np.abs(a), initial=0.0))
 
 
+def test_an_estimated_smoothing_needs_no_other_program_along_an_imposed_motion(monkeypatch):
+    loop, recordings = jaxid.scara(Tracking()), jaxid.read(*FILES)
+    programs = []
+
+    def spy(part, theta, start):
+        kinds = [(np.shape(x), np.asarray(x).dtype) for x in jax.tree.leaves((part, theta, start))]
+        programs.append((jax.tree.structure(part), kinds))
+        return point_around(part, theta, start)
+
+    monkeypatch.setattr(linearising, "point_around", spy)
+    sizes = []
+    for one in (loop, loop.free("eps1", "form2")):
+        problem, theta, start = _problem(one, recordings)
+        found = linearisation(problem, whole=True)(theta, start)
+        sizes.append(found.found.jacobian.shape[-1])
+        expected = point_around(problem, theta, start)
+        np.testing.assert_allclose(found.sums.gram, expected.sums.gram, rtol=1e-9)
+        np.testing.assert_allclose(found.found.jacobian, expected.found.jacobian, rtol=1e-9)
+    assert sizes[1] == sizes[0] + 2
+    assert programs[0] == programs[1]
+
+
 def test_a_mesh_of_one_host_device_takes_its_shares_on_one_thread(monkeypatch):
     problem, theta, start = _problem(jaxid.scara(), jaxid.read(*FILES))
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("recordings",))

@@ -177,11 +177,11 @@ class SerialArm(AbstractArm):
 
     def in_space(self) -> InSpace:
         """Its chain and bodies."""
-        shift = jax.jacfwd(moved_body)(jnp.zeros(10), self.chain.tip)
+        shift, bodies = _shift_and_bodies(self)
         shown = np.asarray(self.combined)[:, -10:] @ np.asarray(shift)
         # Mass and first moments, which also cause gravity torque, before moments of inertia.
         kept = _independent(shown, [9, 6, 7, 8, *range(6)], 1e-6)
-        return InSpace(self.chain, self.inertias(), tuple(kept))
+        return InSpace(self.chain, bodies, tuple(kept))
 
     def couplings(self) -> tuple[tuple[int, int, float], ...]:
         """Pairs that `gears` couples; without `gears`, all neighbouring joints that turn."""
@@ -213,6 +213,14 @@ class SerialArm(AbstractArm):
         masses = jax.vmap(self.mass_matrix)(jnp.asarray(self.workspace()))
         found = jnp.linalg.eigvalsh(masses)
         return jnp.min(found) + 1e-9 * jnp.max(found)
+
+
+@eqx.filter_jit
+def _shift_and_bodies(
+    arm: SerialArm,
+) -> tuple[Float[Array, "10 10"], Float[Array, "joints 10"]]:
+    """Parameters of a body at the tip as those of the last link, and those of all links."""
+    return jax.jacfwd(moved_body)(jnp.zeros(10), arm.chain.tip), arm.inertias()
 
 
 def base_parameters(

@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..parameters import Scalar, as_float64
 from ..recording import Recording
 from ..signals.smoothing import even_times, resampled, signal_cutoff, smooth_motion
 from ._base import AbstractController, Reading, Reference, Signals
@@ -36,8 +37,9 @@ class Tracking(AbstractController):
 
     bandwidth: float = 40.0
     damping: float = 1.0
-    cutoff: float | None = eqx.field(static=True, default=None)
-    delay: float = eqx.field(static=True, default=0.0)
+    # Not static: both are used before any program runs, and programs would depend on them.
+    cutoff: Scalar | None = eqx.field(converter=as_float64, default=None)
+    delay: Scalar = eqx.field(converter=as_float64, default=0.0)
 
     @property
     def pace(self) -> float:
@@ -63,7 +65,7 @@ class Tracking(AbstractController):
 
     def comparable(self, recording: Recording) -> float:
         """Cutoff of the low-pass, Hz."""
-        return self.cutoff or signal_cutoff(recording)
+        return signal_cutoff(recording) if self.cutoff is None else float(self.cutoff)
 
     def settled(self, recordings: Iterable[Recording]) -> "Tracking":
         """The controller with the lowest cutoff of all recordings."""
@@ -74,6 +76,6 @@ class Tracking(AbstractController):
         smooth = smooth_motion(recording, self.comparable(recording))
         times = even_times(recording)
         # Torque belongs to the motion at the time at which it acts; that is unknown at the end.
-        at = np.clip(recording.time + self.delay, times[0], times[-1])
+        at = np.clip(recording.time + float(self.delay), times[0], times[-1])
         q = resampled(times, smooth, at)
         return Signals(q, np.zeros_like(recording.tau))

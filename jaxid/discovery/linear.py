@@ -20,6 +20,7 @@ from ..simulation.runs import advance, at_points, each, run
 from ..simulation.sharing import one_by_one
 from ..simulation.state import unflatten
 from ..simulation.steps import with_forward_mode, with_rolled_stages
+from ..simulation.widening import widened
 
 Place = Literal["push", "noise", "rate", "pull"]
 
@@ -37,9 +38,9 @@ class Linearised(eqx.Module):
     """
 
     A: Float[Array, "recordings points states states"]
-    B: Float[Array, "recordings points states inputs"]
+    B: Float[Any, "recordings points states inputs"]
     C: Float[Array, "recordings points outputs states"]
-    D: Float[Array, "recordings points outputs inputs"]
+    D: Float[Any, "recordings points outputs inputs"]
     start: Float[Array, "recordings states starts"]
     motion: Motion
     seen: Float[Array, "recordings points 5 joints"]
@@ -61,7 +62,12 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     - `output`: which of `SIGNALS` is compared.
     """
     batch = batch.uncompared()
-    linear = one_by_one(lambda one: _linearised(loop, one, output), batch)
+    wide, own = widened(loop)
+    linear = one_by_one(lambda one: _linearised(wide, one, output), batch)
+    columns = np.append(own, np.arange(wide.theta.shape[0], linear.B.shape[-1]))
+    if len(columns) < linear.B.shape[-1]:
+        by_own = (np.asarray(x)[..., columns] for x in (linear.B, linear.D))
+        linear = eqx.tree_at(lambda x: (x.B, x.D), linear, tuple(by_own))
     torques = [linear.inputs(place) for place in ("push", "pull") if place in linear.places]
     direct = not any(np.any(np.asarray(linear.B[..., inputs])) for inputs in torques)
     return dataclasses.replace(linear, direct=direct)

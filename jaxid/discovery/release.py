@@ -13,14 +13,14 @@ from ..simulation.dynamics import imposed
 from ..simulation.integration import SIGNALS
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate_batch
+from ..simulation.widening import SIGN
 from .predict import Predictor
 from .score import spanned
 
 # A positive value is also tried multiplied and divided by this factor.
 _FACTOR = 5.0
-# Fields of a smoothed sign, and the ends of their places among the parameters.
-_SIGN = "smoothing", "form"
-_SIGNS = {(what,) for what in _SIGN}
+# Ends of the places of the fields of a smoothed sign.
+_SIGNS = {(what,) for what in SIGN}
 # Largest delay of a torque in samples that a sampled law explains; a larger one is a mistake in the
 # recordings. Smallest change, as a share of a sample or of a scale, for which a fit is made.
 _LATE, _NOTHING = 2.0, 0.02
@@ -85,7 +85,7 @@ def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str
     found: dict[str, float] = {}
     tried: set[tuple] = set()
     for p in (*doubtful(loop), *_estimated_signs(loop)):
-        together = [names[(*p.place[:2], what)] for what in _SIGN if p.place[2:] in _SIGNS]
+        together = [names[(*p.place[:2], what)] for what in SIGN if p.place[2:] in _SIGNS]
         free = p.place in {q.place for q in loop.free_parameters}
         # A smoothing and a form that are both held, or both free, have the same settings.
         setting = (tuple(together) or p.name), free

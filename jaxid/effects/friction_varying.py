@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..parameters import Scalar, parameter
+from ..parameters import Scalar, as_float64, parameter
 from ._base import AbstractEffect, Motion, on_joint, smooth_sign
 from ._scene import Scene
 from .friction import smoothing_speed
@@ -54,7 +54,8 @@ class PositionDependentFriction(AbstractEffect):
     A2: Scalar = parameter(0.0, symbol="FA2_", unit="N·m", scale=0.1)
     B2: Scalar = parameter(0.0, symbol="FB2_", unit="N·m", scale=0.1)
     smoothing: Scalar = smoothing_speed()
-    turn: float = eqx.field(static=True, default=2 * np.pi)
+    # Not static: programs would depend on it, and it varies with the simulated travel.
+    turn: Scalar = eqx.field(converter=as_float64, default=2 * np.pi)
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["PositionDependentFriction"]:

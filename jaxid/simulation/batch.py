@@ -366,7 +366,7 @@ def compared(
     if band is not None:
         longest = max(len(x) for x in found)
         padded = np.stack([np.pad(x, ((0, longest - len(x)), (0, 0))) for x in found])
-        passed, keep = np.asarray(band(jnp.asarray(padded))), np.asarray(band.keep)
+        passed, keep = np.asarray(compared_part(band, None, padded)), np.asarray(band.keep)
         found = [x[kept] for x, kept in zip(passed, keep, strict=True)]
     if moving is not None:
         found = [x * there[: len(x)] for x, there in zip(found, np.asarray(moving), strict=True)]

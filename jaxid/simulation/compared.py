@@ -14,8 +14,11 @@ Moving = Bool[Any, "recordings rows joints"] | None
 _WIDTHS = 8, 32
 
 
+@compiled
 def compared_part(
-    band: Band | None, moving: Moving, x: Float[Array, "recordings samples *axes"]
+    band: Band | None,
+    moving: Moving,
+    x: Float[Any, "recordings samples *axes"],
 ) -> Float[Array, "recordings rows *axes"]:
     """Signals in the band; zero where a joint stands still.
 

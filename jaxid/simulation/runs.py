@@ -254,5 +254,6 @@ def simulate_batch(loop: ClosedLoop, batch: Batch) -> Simulated:
         substeps = np.asarray(loop.stepping.substeps or 1)
         loop = set_substeps(loop, None, settled=False)
     batch = batch.uncompared()
-    loop = dataclasses.replace(loop, standstill=Standstill())
+    # Neither affects the signals, and a program would depend on them.
+    loop = dataclasses.replace(loop, standstill=Standstill(), held=(), freed=())
     return jax.device_get(one_by_one(lambda one: _simulate(loop, one, substeps), batch))

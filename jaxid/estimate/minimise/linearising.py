@@ -11,6 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
+from ...simulation.integration import given
 from ...simulation.sharing import (
     EndToEnd,
     at_once,
@@ -20,6 +21,7 @@ from ...simulation.sharing import (
     shares_of,
     taken,
 )
+from ...simulation.widening import values_of, widened
 from .problem import Point, Problem, Sums, point_around
 from .residual import Sensitivity
 from .stretches import Stretches
@@ -56,7 +58,13 @@ def linearisation(problem: Problem, whole: bool = False) -> Callable[[Any, Any],
         return lambda theta, start: _over_mesh(problem, mesh, theta, start)
     # Each host device would compile the program, and they would collect results one by one.
     problem = dataclasses.replace(problem, mesh=None)
-    threads = cores() if mesh is None else mesh.size
+    if mesh is None and given(problem.loop):
+        return _Widened.of(problem, whole)
+    return _linearisation(problem, whole, cores() if mesh is None else mesh.size)
+
+
+def _linearisation(problem: Problem, whole: bool, threads: int) -> Callable[[Any, Any], Point]:
+    """`linearisation` on the devices of this machine."""
     recordings, samples = problem.batch.mask.shape
     if recordings * samples <= _WORTH_SHARING:
         threads = 1
@@ -96,6 +104,35 @@ class _Part(eqx.Module):
             return point
         few = dataclasses.replace(point.found, jacobian=None, start=None)
         return dataclasses.replace(point, found=few)
+
+
+class _Widened(eqx.Module):
+    """The linearisation along an imposed motion, by the program of the widened loop.
+
+    Further derivatives take little time there, since nothing is simulated.
+    """
+
+    inner: Callable[[Any, Any], Point]
+    values: Float[np.ndarray, " wide"]
+    own: Int[np.ndarray, " own"]
+
+    @classmethod
+    def of(cls, problem: Problem, whole: bool) -> "_Widened":
+        wide, own = widened(problem.loop)
+        values = values_of(wide)
+        # The bounds do not matter here, but their size is that of all unknowns.
+        bounds = jax.device_put(np.zeros(len(values) + problem.lower.shape[0] - len(own)))
+        wider = dataclasses.replace(problem, loop=wide, lower=bounds, upper=bounds)
+        return cls(_linearisation(wider, whole, cores()), values, own)
+
+    def __call__(
+        self, theta: Float[Any, " parameters"], start: Float[Any, "rows initials"]
+    ) -> Point:
+        theta, values = np.asarray(theta, float), self.values.copy()
+        values[self.own], others = np.split(theta, [len(self.own)])
+        point = self.inner(np.append(values, others), start)
+        kept = np.append(self.own, len(values) + np.arange(len(others)))
+        return dataclasses.replace(point.by(kept), theta=jax.device_put(theta))
 
 
 class _Shared(eqx.Module):

@@ -90,6 +90,12 @@ class Sums(eqx.Module):
 
         return Sums(**{f.name: scaled(getattr(self, f.name)) for f in dataclasses.fields(self)})
 
+    def by(self, kept: Int[np.ndarray, " kept"]) -> "Sums":
+        """The products for some of the parameters."""
+        gram = np.asarray(self.gram)[:, kept[:, None], kept]
+        slope, cross = (np.asarray(x)[..., kept] for x in (self.slope, self.cross))
+        return dataclasses.replace(self, gram=gram, slope=slope, cross=cross)
+
 
 class Point(eqx.Module):
     """A set of parameter values and initial states, and the least-squares problem around it.
@@ -106,6 +112,14 @@ class Point(eqx.Module):
     found: Sensitivity
     sums: Sums
     loss: Float[Any, ""]
+
+    def by(self, kept: Int[np.ndarray, " kept"]) -> "Point":
+        """The point with derivatives by some of the parameters."""
+        found = self.found
+        if found.jacobian is not None:
+            found = dataclasses.replace(found, jacobian=np.asarray(found.jacobian)[..., kept])
+        theta = np.asarray(self.theta)[kept]
+        return dataclasses.replace(self, theta=theta, found=found, sums=self.sums.by(kept))
 
 
 class Problem(eqx.Module):

@@ -1,0 +1,32 @@
+"""A loop with more free parameters, whose program serves loops with some of them free."""
+
+import dataclasses
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from .loop import ClosedLoop
+
+# Fields of a smoothed sign, which a search holds at first and may estimate later.
+SIGN = "smoothing", "form"
+
+
+def widened(loop: ClosedLoop) -> tuple[ClosedLoop, Int[np.ndarray, " own"]]:
+    """The loop with the shape of every sign free, and the places of its own free parameters.
+
+    A compiled program depends on which parameters are free. Programs for the widened loop need not
+    be compiled again when a search estimates a smoothing.
+    """
+    signs = {p.place for p in loop.parameters if p.place[-1] in SIGN}
+    wide = dataclasses.replace(loop, held=loop.held - signs, freed=loop.freed | signs)
+    own = {p.place for p in loop.free_parameters}
+    return wide, np.flatnonzero(
+        [p.place in own for p in wide.free_parameters for _ in range(p.size)]
+    )
+
+
+def values_of(loop: ClosedLoop) -> Float[np.ndarray, " parameters"]:
+    """The values of the free parameters, without a compiled program."""
+    found = jax.device_get([p.where(loop) for p in loop.free_parameters])
+    return np.concatenate([np.ravel(x) for x in found]) if found else np.zeros(0)
