@@ -99,10 +99,8 @@ def pendulum(shared_file):
 def pendulum_fits(pendulum):
     """By inverse dynamics, by output error in windows, and with a virtual controller."""
     fitting, _ = pendulum
-    loops = {
-        law: jaxid.two_link(law, link_length=0.3) for law in (Tracking(cutoff=8.0), OpenLoop())
-    }
-    tracking, driven = loops.values()
+    laws = Tracking(cutoff=8.0), OpenLoop()
+    tracking, driven = (jaxid.two_link(law, link_length=0.3) for law in laws)
     return {
         "idim": jaxid.fit(tracking, fitting, jaxid.IDIM(FILTERING)),
         "open loop": jaxid.fit(driven, fitting, jaxid.OEM(window=0.5)),
