@@ -1,6 +1,7 @@
 """Set up JAX and shape checking before anything imports jaxid; fixtures for shared recordings."""
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -40,6 +41,16 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip("no ../shared/data beside the checkout")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def chromium() -> str:
+    """Path of the system's chromium, which also draws figures as images; skips where absent."""
+    names = ("chromium", "chromium-browser", "google-chrome", "chrome")
+    found = next((path for path in map(shutil.which, names) if path), None)
+    if found is None:
+        pytest.skip(f"none of {', '.join(names)} is installed")
+    return found
 
 
 @pytest.fixture(scope="session")

@@ -239,6 +239,7 @@ def test_evidence_counts_what_result_files_say():
     assert "| 4 to 8 | 1 of 1 (21 to 100 %) | 1 of 1 (21 to 100 %) |" in made["power"]
 
 
+@pytest.mark.usefixtures("chromium")
 def test_evidence_leaves_hand_written_text_and_draws_the_curves(tmp_path):
     pytest.importorskip("kaleido")
     from benchmarks import _world_results as results

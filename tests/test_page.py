@@ -3,7 +3,6 @@
 Figures in sight are drawn without scrolling; those of joints that are not chosen when they are.
 """
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not 
 # What one worker has fitted serves all of them.
 pytestmark = [pytest.mark.xdist_group("demo"), pytest.mark.slow]
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 DRAWN = """() => [...document.querySelectorAll("[data-figure]")].filter(
     (box) => box.offsetParent !== null).every(
     (box) => box.querySelector(".main-svg .plot, .main-svg .cartesianlayer path"))"""
@@ -42,13 +40,10 @@ CUT_OFF = """() => [...document.querySelectorAll("[data-figure]")].filter((box) 
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """The system's chromium, headless; skips where there is none."""
-    found = next((path for path in map(shutil.which, NAMES) if path), None)
-    if found is None:
-        pytest.skip(f"none of {', '.join(NAMES)} is installed")
+def browser(chromium: str) -> Iterator[Any]:
+    """The system's chromium, headless."""
     with sync_api.sync_playwright() as playwright:
-        running = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        running = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         yield running
         running.close()
 
