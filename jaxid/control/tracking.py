@@ -65,7 +65,7 @@ class Tracking(AbstractController):
 
     def comparable(self, recording: Recording) -> float:
         """Cutoff of the low-pass, Hz."""
-        return signal_cutoff(recording) if self.cutoff is None else float(self.cutoff)
+        return float(self.cutoff or signal_cutoff(recording))
 
     def settled(self, recordings: Iterable[Recording]) -> "Tracking":
         """The controller with the lowest cutoff of all recordings."""

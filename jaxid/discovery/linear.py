@@ -63,11 +63,15 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
     """
     batch = batch.uncompared()
     wide, own = widened(loop)
-    linear = one_by_one(lambda one: _linearised(wide, one, output), batch)
-    columns = np.append(own, np.arange(wide.theta.shape[0], linear.B.shape[-1]))
-    if len(columns) < linear.B.shape[-1]:
-        by_own = (np.asarray(x)[..., columns] for x in (linear.B, linear.D))
-        linear = eqx.tree_at(lambda x: (x.B, x.D), linear, tuple(by_own))
+    others = wide.theta.shape[0]
+
+    def along(one: Batch) -> Linearised:
+        found = _linearised(wide, one, output)
+        inputs = np.append(own, np.arange(others, found.B.shape[-1]))
+        B, D = (np.asarray(x)[..., inputs] for x in (found.B, found.D))
+        return dataclasses.replace(found, B=B, D=D)
+
+    linear = one_by_one(along, batch)
     torques = [linear.inputs(place) for place in ("push", "pull") if place in linear.places]
     direct = not any(np.any(np.asarray(linear.B[..., inputs])) for inputs in torques)
     return dataclasses.replace(linear, direct=direct)

@@ -2,9 +2,8 @@
 
 import dataclasses
 
-import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from .loop import ClosedLoop
 
@@ -13,10 +12,12 @@ SIGN = "smoothing", "form"
 
 
 def widened(loop: ClosedLoop) -> tuple[ClosedLoop, Int[np.ndarray, " own"]]:
-    """The loop with the shape of every sign free, and the places of its own free parameters.
+    """The loop with the shape of every sign free, and where its own parameters are among them.
 
     A compiled program depends on which parameters are free. Programs for the widened loop need not
     be compiled again when a search estimates a smoothing.
+
+    **Returns:** the widened loop, and the indices of the values of `loop.theta` in its `theta`.
     """
     signs = {p.place for p in loop.parameters if p.place[-1] in SIGN}
     wide = dataclasses.replace(loop, held=loop.held - signs, freed=loop.freed | signs)
@@ -24,9 +25,3 @@ def widened(loop: ClosedLoop) -> tuple[ClosedLoop, Int[np.ndarray, " own"]]:
     return wide, np.flatnonzero(
         [p.place in own for p in wide.free_parameters for _ in range(p.size)]
     )
-
-
-def values_of(loop: ClosedLoop) -> Float[np.ndarray, " parameters"]:
-    """The values of the free parameters, without a compiled program."""
-    found = jax.device_get([p.where(loop) for p in loop.free_parameters])
-    return np.concatenate([np.ravel(x) for x in found]) if found else np.zeros(0)

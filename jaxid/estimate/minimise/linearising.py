@@ -21,7 +21,7 @@ from ...simulation.sharing import (
     shares_of,
     taken,
 )
-from ...simulation.widening import values_of, widened
+from ...simulation.widening import widened
 from .problem import Point, Problem, Sums, point_around
 from .residual import Sensitivity
 from .stretches import Stretches
@@ -64,7 +64,7 @@ def linearisation(problem: Problem, whole: bool = False) -> Callable[[Any, Any],
 
 
 def _linearisation(problem: Problem, whole: bool, threads: int) -> Callable[[Any, Any], Point]:
-    """`linearisation` on the devices of this machine."""
+    """`linearisation` on this machine, by so many threads."""
     recordings, samples = problem.batch.mask.shape
     if recordings * samples <= _WORTH_SHARING:
         threads = 1
@@ -110,6 +110,9 @@ class _Widened(eqx.Module):
     """The linearisation along an imposed motion, by the program of the widened loop.
 
     Further derivatives take little time there, since nothing is simulated.
+
+    - `inner`: the linearisation of the widened problem. `values`: all values of its loop.
+    - `own`: indices of the values that the problem estimates.
     """
 
     inner: Callable[[Any, Any], Point]
@@ -119,7 +122,7 @@ class _Widened(eqx.Module):
     @classmethod
     def of(cls, problem: Problem, whole: bool) -> "_Widened":
         wide, own = widened(problem.loop)
-        values = values_of(wide)
+        values = np.asarray(wide.theta)
         # The bounds do not matter here, but their size is that of all unknowns.
         bounds = jax.device_put(np.zeros(len(values) + problem.lower.shape[0] - len(own)))
         wider = dataclasses.replace(problem, loop=wide, lower=bounds, upper=bounds)
@@ -128,11 +131,10 @@ class _Widened(eqx.Module):
     def __call__(
         self, theta: Float[Any, " parameters"], start: Float[Any, "rows initials"]
     ) -> Point:
-        theta, values = np.asarray(theta, float), self.values.copy()
-        values[self.own], others = np.split(theta, [len(self.own)])
-        point = self.inner(np.append(values, others), start)
-        kept = np.append(self.own, len(values) + np.arange(len(others)))
-        return dataclasses.replace(point.by(kept), theta=jax.device_put(theta))
+        values = self.values.copy()
+        values[self.own], coefficients = np.split(np.asarray(theta), [len(self.own)])
+        point = self.inner(np.append(values, coefficients), start)
+        return point.with_only(np.append(self.own, len(values) + np.arange(len(coefficients))))
 
 
 class _Shared(eqx.Module):

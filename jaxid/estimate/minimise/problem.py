@@ -90,8 +90,8 @@ class Sums(eqx.Module):
 
         return Sums(**{f.name: scaled(getattr(self, f.name)) for f in dataclasses.fields(self)})
 
-    def by(self, kept: Int[np.ndarray, " kept"]) -> "Sums":
-        """The products for some of the parameters."""
+    def with_only(self, kept: Int[np.ndarray, " kept"]) -> "Sums":
+        """The products of some parameters, given by their indices."""
         gram = np.asarray(self.gram)[:, kept[:, None], kept]
         slope, cross = (np.asarray(x)[..., kept] for x in (self.slope, self.cross))
         return dataclasses.replace(self, gram=gram, slope=slope, cross=cross)
@@ -113,13 +113,13 @@ class Point(eqx.Module):
     sums: Sums
     loss: Float[Any, ""]
 
-    def by(self, kept: Int[np.ndarray, " kept"]) -> "Point":
-        """The point with derivatives by some of the parameters."""
+    def with_only(self, kept: Int[np.ndarray, " kept"]) -> "Point":
+        """The point with only some of its parameters, given by their indices."""
         found = self.found
         if found.jacobian is not None:
             found = dataclasses.replace(found, jacobian=np.asarray(found.jacobian)[..., kept])
-        theta = np.asarray(self.theta)[kept]
-        return dataclasses.replace(self, theta=theta, found=found, sums=self.sums.by(kept))
+        theta = jnp.asarray(np.asarray(self.theta)[kept])
+        return dataclasses.replace(self, theta=theta, found=found, sums=self.sums.with_only(kept))
 
 
 class Problem(eqx.Module):
