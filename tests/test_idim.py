@@ -121,6 +121,25 @@ def test_cutoff_is_where_the_encoder_noise_lifts_the_acceleration():
     assert 20 / 1.6 < signal_cutoff(recording) < 20 * 1.6
 
 
+@pytest.mark.parametrize("seed", [3, 11])
+def test_a_gap_between_reference_and_response_is_not_the_cutoff(seed):
+    """A loop answers friction at its bandwidth, 6 Hz, with a reference below 0.5 Hz.
+
+    With the second seed the level at 2 Hz is by chance lower than that at 24 Hz.
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 10.0, 0.004)
+    f = np.fft.rfftfreq(len(t), 0.004)[1:]
+    phases = 2 * np.pi * np.outer(t, [0.17, 0.31, 0.43]) + rng.uniform(0, 6, 3)
+    # Relative amplitudes of acceleration: the response, and the encoder's noise.
+    response = np.exp(-0.5 * (np.log(f / 6.0) / 0.5) ** 2)
+    noise = 0.04 * (f / 18.0) ** 2
+    random = rng.standard_normal((2, len(f))) + 1j * rng.standard_normal((2, len(f)))
+    wave = (random[0] * response + random[1] * noise) / f**2
+    q = np.sin(phases).sum(axis=1) + 30 * np.fft.irfft(np.append(0.0, wave), len(t))
+    assert 15.0 < signal_cutoff(jaxid.Recording.from_arrays(t, q, q)) < 30.0
+
+
 def test_cutoff_is_found_with_a_joint_that_stands_still(noisy):
     r = noisy[0][0]
     # A recording's joint moves by a count at least, else it is taken for a wrong column.

@@ -59,7 +59,8 @@ class Box(eqx.Module):
 def test_names_are_symbols_with_the_joint_in_the_order_of_the_fields():
     names = [p.name for p in jaxid.scara().parameters]
     arm = ["ZZ1r", "ZZ2", "MX2", "MY2"]
-    assert names == [*arm, "Fv1", "Fc1", "eps1", "form1", "Fv2", "Fc2", "eps2", "form2"]
+    friction = ["Fv", "Fc", "eps", "form", "lead"]
+    assert names == [*arm, *(f"{name}{j}" for j in (1, 2) for name in friction)]
     assert jaxid.scara().names == (*arm, "Fv1", "Fc1", "Fv2", "Fc2")
     assert [p.joint for p in jaxid.scara().parameters][3:6] == [None, 1, 1]
 
@@ -141,6 +142,7 @@ def test_units_of_joints_that_slide():
         "Fc1": "N",
         "eps1": "m/s",
         "form1": "1",
+        "lead1": "s",
         "offset1": "N",
     }
     assert jaxid.scara().unit(jaxid.scara().parameters[4]) == "N·m·s/rad"

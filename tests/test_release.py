@@ -3,6 +3,8 @@
 Torque is that of inverse dynamics written out here, along motions in closed form.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,12 +23,20 @@ MASS, DRAG, DRY, STIFF = 5.0, 4.0, 3.0, 8.0
 
 def test_a_smoothed_sign_is_a_half_at_its_smoothing_and_a_sign_at_none():
     v = jnp.array([-0.3, -0.02, 0.02, 0.3])
-    for form in (0.0, 0.4, 1.0):
+    for form in (0.0, 0.4, 1.0, 1.3, 1.5):
         half = smooth_sign(jnp.asarray(0.02), jnp.asarray(0.02), jnp.asarray(form))
         assert float(half) == pytest.approx(0.5, rel=1e-12)
         sharp = smooth_sign(v, jnp.asarray(0.0), jnp.asarray(form))
         np.testing.assert_allclose(sharp, np.sign(v), atol=1e-12)
         assert float(smooth_sign(jnp.asarray(0.0), jnp.asarray(0.0), jnp.asarray(form))) == 0
+    # The last form is a ramp up to its corners, and none exceeds one visibly.
+    ramp = smooth_sign(jnp.linspace(-0.03, 0.03, 13), jnp.asarray(0.02), jnp.asarray(1.5))
+    np.testing.assert_allclose(ramp, np.linspace(-0.75, 0.75, 13), atol=0.01)
+    for form in np.linspace(0.0, 1.5, 16):
+        rise = np.asarray(
+            smooth_sign(jnp.linspace(0, 1, 400), jnp.asarray(0.02), jnp.asarray(form))
+        )
+        assert rise.max() < 1.004
     # At its bound the derivative is that of arctan2: a search that went there finds the way back.
     slope = jax.grad(lambda eps: smooth_sign(jnp.asarray(0.02), eps))(0.0)
     assert float(slope) == pytest.approx(-2 / np.pi / 0.02, rel=1e-9)
@@ -70,9 +80,9 @@ def predictor(recordings, loop=None):
 
 
 def test_held_values_are_in_doubt_unless_a_user_held_them():
-    assert [p.name for p in doubtful(axis())] == ["eps1", "form1"]
-    assert [p.name for p in doubtful(axis().free("eps1"))] == ["form1"]
-    assert [p.name for p in doubtful(axis().hold("form1"))] == ["eps1"]
+    assert [p.name for p in doubtful(axis())] == ["eps1", "form1", "lead1"]
+    assert [p.name for p in doubtful(axis().free("eps1"))] == ["form1", "lead1"]
+    assert [p.name for p in doubtful(axis().hold("form1"))] == ["eps1", "lead1"]
 
 
 def test_nothing_is_released_where_the_default_is_right():
@@ -98,6 +108,38 @@ def test_a_delay_of_the_torque_is_released():
     assert found is not None
     assert found.freedom == 1
     assert found.loop.controller.delay == pytest.approx(late, rel=0.1)
+
+
+def test_friction_that_precedes_velocity_is_released():
+    """The dry friction of a soft constraint: a ramp of the velocity that the joint would reach."""
+    lead, corner = 0.0095, 0.03
+
+    def soft(v):
+        ahead = v + lead * np.gradient(v, 0.004)
+        return np.clip(ahead / corner, -1, 1)
+
+    runs = [recorded(k, soft) for k in (6, 7)]
+    loop = axis().with_values(eps1=corner / 2, form1=1.5)
+    found = released(predictor(runs, loop.free("eps1")), 20.0)
+    assert found is not None
+    assert "lead1" in found.loop.names
+    table = jaxid.fit(found.loop, runs, jaxid.OEM(progress=False)).table()
+    assert table.loc["lead1", "value"] == pytest.approx(lead, abs=4 * table.loc["lead1", "std"])
+    assert table.loc["lead1", "std"] < 0.001
+
+
+def test_a_lead_of_friction_acts_only_along_an_imposed_motion():
+    loop = axis().with_values(lead1=0.0095)
+    run = recorded(8, tanh)
+    along = [jaxid.simulate(x, run)[0].tau for x in (loop, axis())]
+    assert np.abs(along[0] - along[1]).max() > 0.1 * DRY
+    law = jaxid.control.PD(Kp=[400.0], Kv=[40.0])
+    reference = jaxid.Recording.from_arrays(run.time, run.q, run.tau, q_ref=run.q)
+    moved = [
+        jaxid.simulate(dataclasses.replace(x, controller=law), reference)[0].tau
+        for x in (loop, axis())
+    ]
+    np.testing.assert_array_equal(*moved)
 
 
 @pytest.mark.slow

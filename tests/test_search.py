@@ -22,7 +22,8 @@ from jaxid.discovery.likelihood import price, score, weights
 from jaxid.discovery.models import Model, Visited, probability
 from jaxid.discovery.score import Data
 from jaxid.discovery.search import Search
-from jaxid.discovery.verify import of_one_sign, undetermined
+from jaxid.discovery.signs import of_one_sign
+from jaxid.discovery.verify import undetermined
 from jaxid.effects import (
     AbstractEffect,
     Backlash,
@@ -308,6 +309,33 @@ def test_a_load_that_drives_the_axis_into_its_limit_is_found():
     place = found.fit.names.index("payload")
     assert abs(found.fit.theta[place] - load.mass) < 4 * found.fit.std[place]
     assert found.loop.effects[-1].recordings == load.recordings
+
+
+def _two_link(case):
+    law = jaxid.control.PD(**dataclasses.asdict(case.controller))
+    return jaxid.two_link(law)
+
+
+@pytest.mark.slow
+def test_a_gap_that_is_wider_than_its_signatures_is_found():
+    """The best signature of a gap explains 0.2 %, and all others less than they cost."""
+    gap = fx.Backlash(2, 0.12253, 0.0043017, 103.408, 3.0)
+    case = sim.make_case(1157893421, [gap], noise="white", robot="two_link")
+    found = jaxid.discover(_two_link(case), *recordings_of(case), progress=False)
+    assert [(a["effect"], a["joint"]) for a in found.to_dict()["added"]] == [("backlash", 2)]
+    place = found.fit.names.index("gap2")
+    assert abs(found.fit.theta[place] - gap.gap) < 4 * found.fit.std[place]
+
+
+@pytest.mark.slow
+def test_two_large_effects_are_fitted_one_after_the_other():
+    """A fit of both at once, from their predicted values, does not converge."""
+    ripple = fx.TorqueRipple(1, -0.093813, -0.221357, 4.0)
+    tilt = fx.Gravity(0.0, 0.2, 0.369468)
+    case = sim.make_case(1365823038, [ripple, tilt], noise="moderate", robot="two_link")
+    found = jaxid.discover(_two_link(case), *recordings_of(case), progress=False)
+    assert {a["effect"] for a in found.to_dict()["added"]} == {"gravity", "torque_ripple"}
+    assert found.verdict == "explained"
 
 
 @pytest.mark.parametrize("left", [None, 3.0, 1.1])

@@ -80,7 +80,10 @@ def survey(
     q = np.asarray(motion.q).reshape(-1, loop.joints)
     low, high = q.min(axis=0), q.max(axis=0)
     speed = np.abs(np.asarray(motion.v)).reshape(-1, loop.joints).max(axis=0)
-    smoothed = {e.joint: float(e.smoothing) for e in loop.effects if isinstance(e, Coulomb)}
+    signs = {
+        e.joint: (float(e.smoothing), float(e.form)) for e in loop.effects if isinstance(e, Coulomb)
+    }
+    smoothing, form = np.array([signs.get(j, (0.01, 0.0)) for j in range(1, loop.joints + 1)]).T
     return Scene(
         low,
         # A joint at rest gets a small travel, because shapes are shares of it.
@@ -88,7 +91,8 @@ def survey(
         np.maximum(speed, 1e-6),
         np.abs(np.asarray(motion.tau)).reshape(-1, loop.joints).max(axis=0),
         _inertia(loop, q),
-        np.array([smoothed.get(j, 0.01) for j in range(1, loop.joints + 1)]),
+        smoothing,
+        form,
         float(np.median([r.period for r in recordings])),
         float(max(r.duration for r in recordings)),
         tuple(recordings.names),
@@ -152,7 +156,7 @@ def curves(scene: Scene, motion: Motion, knots: int = 12) -> list[Curve]:
                         high=high,
                         signed=signed,
                         coefficients=jnp.zeros(knots),
-                        smoothing=scene.smoothed(joint),
+                        **scene.sign(joint),
                     )
                 )
     return made

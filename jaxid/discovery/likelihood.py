@@ -20,9 +20,9 @@ class Score(eqx.Module):
     """The score S = -2 log L + k log n + 2 log C(P, s), and the noise filters that belong to it.
 
     L is the likelihood of the fitted recordings, n the number of compared samples of all joints, k
-    the number of estimated values and filter coefficients, and C(P, s) the number of sets of s of P
-    effects. A smaller score is better: the weight of a model is proportional to exp(-S/2) (Schwarz
-    1978; Chen and Chen 2008).
+    the number of estimated values (minus combinations that the recordings do not determine) and
+    filter coefficients, and C(P, s) the number of sets of s of P effects. A smaller score is
+    better: the weight of a model is proportional to exp(-S/2) (Schwarz 1978; Chen and Chen 2008).
     """
 
     value: float
@@ -53,7 +53,7 @@ def score(
 def score_of(fit: Fit, size: int = 0, offered: int = 0) -> Score:
     """The score of a fit, comparable with that of a prediction by `score`."""
     series = [[r[:, j] for r in fit.residuals] for j in range(fit.residuals[0].shape[1])]
-    return _scored(series, len(fit.names), price(size, offered))
+    return _scored(series, len(fit.names) - len(fit.undetermined), price(size, offered))
 
 
 def noise_filters(

@@ -13,7 +13,7 @@ from ..compiling import compiled
 from ..effects import AbstractTransmission, Motion
 from ..simulation.batch import Batch, Interval
 from ..simulation.compared import compared_table
-from ..simulation.dynamics import link_load
+from ..simulation.dynamics import imposed, link_load
 from ..simulation.integration import SIGNALS, initial
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import advance, at_points, each, run
@@ -119,7 +119,9 @@ def _linearised(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
         )
         own = jax.vmap(lambda x: unflatten(loop)(x).effects)(states)
         load = jax.vmap(lambda at, own: link_load(loop, at, own))(motion, own)
-        motion = jax.vmap(lambda at, load: dataclasses.replace(at, load=load))(motion, load)
+        motion = jax.vmap(
+            lambda at, load: dataclasses.replace(at, load=load, imposed=imposed(loop))
+        )(motion, load)
         return a, b, c, d, start, motion, seen
 
     return Linearised(*each(whole, batch.intervals, batch.q0, batch.v0), places=places)

@@ -240,7 +240,8 @@ class Predictor(eqx.Module):
             slopes=-found.white[:, 1:],
             taken=found.taken,
             loss=float(found.loss),
-            freedom=self.basis.shape[1] + len(values),
+            # A value that the base absorbs is not determined.
+            freedom=self.basis.shape[1] + int(np.count_nonzero(found.white[:, 1:].any(axis=0))),
             possible=bool(there) and sized,
         )
 

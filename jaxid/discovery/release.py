@@ -7,20 +7,18 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import Coulomb
 from ..parameters import Parameter
 from ..simulation.dynamics import imposed
 from ..simulation.integration import SIGNALS
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate_batch
-from ..simulation.widening import SIGN
+from ..simulation.widening import LEAD, SIGN
 from .predict import Predictor
 from .score import spanned
+from .signs import OF_SIGN, follows
 
 # A positive value is also tried multiplied and divided by this factor.
 _FACTOR = 5.0
-# Ends of the places of the fields of a smoothed sign.
-_SIGNS = {(what,) for what in SIGN}
 # Largest delay of a torque in samples that a sampled law explains; a larger one is a mistake in the
 # recordings. Smallest change, as a share of a sample or of a scale, for which a fit is made.
 _LATE, _NOTHING = 2.0, 0.02
@@ -52,7 +50,13 @@ def released(predictor: Predictor, price: float) -> Release | None:
     """
     loop = predictor.system.loop
     nominal = _signal(predictor, loop)
-    values = _shapes(predictor, nominal, price)
+    values, gains = _shapes(predictor, nominal, price)
+    late, gain = _lateness(predictor, nominal, price)
+    leads = {p.name for p in loop.parameters if p.place[-1] == LEAD} & values.keys()
+    # A lead also explains a part of a sign of the wrong shape, which is released first. A delay of
+    # the torque looks like leads of all frictions, but explains inertia as well.
+    if len(leads) < len(values) or (late and gain > sum(gains[name] for name in leads)):
+        values = {name: value for name, value in values.items() if name not in leads}
     if values:
         held = [p.name for p in doubtful(loop) if p.name in values]
         free = loop.with_values(**values).free(*held)
@@ -63,7 +67,6 @@ def released(predictor: Predictor, price: float) -> Release | None:
         start = ", ".join(f"{name} {value:.3g}" for name, value in values.items())
         least = _fall(predictor, price)
         return Release(free, f"estimates that begin at {start}", least, again=True)
-    late, gain = _lateness(predictor, nominal, price)
     if late == 0:
         return None
     delay = loop.controller.delay + late  # type: ignore[reportAttributeAccessIssue]
@@ -73,19 +76,24 @@ def released(predictor: Predictor, price: float) -> Release | None:
     return Release(moved, said, _fall(predictor, gain), freedom=1)
 
 
-def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str, float]:
+def _shapes(
+    predictor: Predictor, nominal: np.ndarray, price: float
+) -> tuple[dict[str, float], dict[str, float]]:
     """Start values of the shapes whose change explains more than its price, by name.
 
     Smoothing and form of one sign are changed together, because a fit can replace one by the other.
     The change of the signal by each setting is compared with the residual like the signature of an
     effect.
+
+    **Returns:** the values, and what the change of each explains of the squared error.
     """
     loop = predictor.system.loop
     names = {p.place: p.name for p in loop.parameters}
     found: dict[str, float] = {}
+    gains: dict[str, float] = {}
     tried: set[tuple] = set()
     for p in (*doubtful(loop), *_estimated_signs(loop)):
-        together = [names[(*p.place[:2], what)] for what in SIGN if p.place[2:] in _SIGNS]
+        together = [names[(*p.place[:2], what)] for what in SIGN if p.place[2:] in OF_SIGN]
         free = p.place in {q.place for q in loop.free_parameters}
         # A smoothing and a form that are both held, or both free, have the same settings.
         setting = (tuple(together) or p.name), free
@@ -100,7 +108,8 @@ def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str
             if np.isfinite(change).all() and (explained := gain(predictor, change)) > most:
                 best, most = values, explained
         found |= best
-    return found
+        gains |= dict.fromkeys(best, most)
+    return found, gains
 
 
 def _changes(
@@ -130,7 +139,7 @@ def _estimated_signs(loop: ClosedLoop) -> list[Parameter]:
     """
     if not imposed(loop):
         return []
-    return [p for p in loop.free_parameters if p.place[2:] in _SIGNS and not _follows(p, loop)]
+    return [p for p in loop.free_parameters if p.place[2:] in OF_SIGN and not follows(p, loop)]
 
 
 def _instead(sign: Parameter) -> Callable[[Predictor, np.ndarray], float]:
@@ -141,7 +150,7 @@ def _instead(sign: Parameter) -> Callable[[Predictor, np.ndarray], float]:
 
     def gain(predictor: Predictor, change: np.ndarray) -> float:
         free = predictor.system.loop.free_parameters
-        owner = [p.place[:2] == sign.place[:2] and p.place[2:] in _SIGNS for p in free]
+        owner = [p.place[:2] == sign.place[:2] and p.place[2:] in OF_SIGN for p in free]
         gone = np.repeat(owner, [p.size for p in free])
         base = predictor.data.base
         kept = base[..., np.concatenate([~gone, np.ones(base.shape[-1] - len(gone), bool)])]
@@ -160,7 +169,7 @@ def _settings(p: Parameter, together: list[str], loop: ClosedLoop) -> list[dict[
     if not together:
         return [{p.name: value} for value in _elsewhere(p, loop)]
     smoothing, form = together
-    signs = [q for q in loop.parameters if q.place[2:] in _SIGNS]
+    signs = [q for q in loop.parameters if q.place[2:] in OF_SIGN]
     named = {q.name: float(np.asarray(q.where(loop))) for q in signs}
     # Multiplication does not change a value at the bound zero.
     scale = next(q.declaration.scale for q in signs if q.name == smoothing)
@@ -168,7 +177,7 @@ def _settings(p: Parameter, together: list[str], loop: ClosedLoop) -> list[dict[
     # Along an imposed motion a setting costs almost nothing.
     fine = imposed(loop)
     factors = (0.2, 0.4, 0.7, 1.0, 1.5, 2.5, 5.0) if fine else (0.2, 1.0, 5.0)
-    forms = (0.0, 0.3, 0.6, 1.0) if fine else (0.0, 1.0)
+    forms = (0.0, 0.3, 0.6, 1.0, 1.5) if fine else (0.0, 1.0)
     held = {q.name for q in (*doubtful(loop), *loop.free_parameters)}
     chosen = [
         {smoothing: centre * factor, form: value}
@@ -233,9 +242,11 @@ def _compared(predictor: Predictor, change: np.ndarray) -> np.ndarray:
 def doubtful(loop: ClosedLoop) -> list[Parameter]:
     """Shapes of the model's effects that are held by declaration, not by the user.
 
-    Smoothings that follow that of the joint's Coulomb friction are left out.
+    Shapes of signs that follow those of the joint's Coulomb friction are left out, and leads unless
+    the motion is imposed.
     """
     free = {p.place for p in loop.free_parameters}
+    leads = imposed(loop)
     return [
         p
         for p in loop.parameters
@@ -243,14 +254,9 @@ def doubtful(loop: ClosedLoop) -> list[Parameter]:
         and p.size == 1
         and not (p.declaration.free or p.declaration.linear)
         and p.place not in free | loop.held
-        and not _follows(p, loop)
+        and (leads or p.place[-1] != LEAD)
+        and not follows(p, loop)
     ]
-
-
-def _follows(p: Parameter, loop: ClosedLoop) -> bool:
-    """Whether a smoothing follows that of the joint's Coulomb friction."""
-    effect = loop.effects[int(p.place[1])] if p.place[0] == "effects" else None
-    return p.place[2:] == ("smoothing",) and not isinstance(effect, Coulomb)
 
 
 def _elsewhere(p: Parameter, loop: ClosedLoop) -> list[float]:

@@ -8,6 +8,7 @@ from ..effects import ActuatorLag, TimeDelay
 from ..estimate import Fit
 from ..estimate.standstill import slow_note
 from ..simulation.loop import ClosedLoop
+from ..simulation.widening import LEAD
 from .step import Step
 
 
@@ -25,6 +26,11 @@ def remarks(steps: Sequence[Step], given: ClosedLoop) -> tuple[str, ...]:
     return (*(said if bad else ()), *more)
 
 
+# What the lead of a friction means.
+_LEADS = (
+    "; friction that precedes velocity is that of a simulator with soft constraints, and "
+    "simulations of a control law do not include the lead"
+)
 # Deviations between an estimate and the default value that it contradicts.
 _APART = 3.0
 
@@ -48,6 +54,7 @@ def _estimated(fit: Fit, given: ClosedLoop) -> list[str]:
                 f"{said} ± {std:.2g}{unit}: these recordings "
                 + ("" if far else "do not ")
                 + f"contradict its default value of {before:.3g}"
+                + (_LEADS if p.place[-1] == LEAD else "")
             )
     before, after = (getattr(x.controller, "delay", 0.0) for x in (given, fit.loop))
     if after != before and fit.loop.controller.imposes:

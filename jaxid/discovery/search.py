@@ -17,6 +17,7 @@ from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
 from .asked import Asked
+from .contacts import suspected
 from .diagnosis import Diagnosis, over_recordings, share_left
 from .explore import DECISIVE, Candidate, explore, key_of
 from .fits import Fits, released_names
@@ -97,6 +98,8 @@ class Search:
                 self.removed = (*self.removed, *gone)
             if better is None:
                 better = self._replaced(at)
+            if better is None:
+                better = self._in_contact(at)
             if better is None:
                 break
             at = better
@@ -367,6 +370,26 @@ class Search:
             if fit.status.simulated:
                 best = min(best, self._visit(self._added(fit), fit), key=lambda m: m.score)
         return None if best is at else best
+
+    def _in_contact(self, at: Model) -> Model | None:
+        """The best fit with a contact of which predictions explain too little, if it is better."""
+        assert at.fit is not None
+        full, best = len(at.effects) >= self.asked.most, at
+        if full or imposed(at.fit.loop) or at.key not in self.diagnoses:
+            return None
+        for contact in suspected(self.diagnoses[at.key]):
+            if self.visited.fitted((*at.effects, contact)) is not None:
+                continue
+            self.watched.begin("fit", f"fit with {listed([contact])}", ROUND)
+            try:
+                fit = self.fits.with_effects(at.fit, at.effects, (contact,), at.noise, 0.0)
+            except (ModelError, FitError) as error:
+                said = f"no fit with {listed([contact])}: {error}"
+                self.failures = (*self.failures, said)
+                continue
+            if fit.status.simulated:
+                best = min(best, self._visit(self._added(fit), fit), key=lambda m: m.score)
+        return best if best.score < at.score - LIKELY else None
 
     def _visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
         """A fitted model, which is stored and drawn."""

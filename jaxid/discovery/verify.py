@@ -2,12 +2,11 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import numpy as np
 
-from ..effects import AbstractEffect, AbstractTransmission, Coulomb
+from ..effects import AbstractEffect, AbstractTransmission
 from ..estimate import OEM, Fit, SeparablePEM, Status, fit
 from ..noise import ARFilter
 from ..parameters import Bounds, read_values, write_values
@@ -15,6 +14,7 @@ from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
 from .hypotheses import free_of
 from .likelihood import score_of
+from .signs import of_one_sign
 
 # Factor on the gap at the start of another refit. In a wide gap the link moves freely for longer,
 # so that all parameters of the contact influence the motion.
@@ -58,7 +58,8 @@ class Refits(eqx.Module):
         their fit from the minimum, so another refit starts from a fit without filters. A contact
         with a held stiffness has many local minima, so further refits start with the stiffness
         free. If the score decreases much more or much less than predicted, the refit is repeated
-        from a fit that assumes white noise.
+        from a fit that assumes white noise; of several effects, also from fits of one after the
+        other.
 
         **Arguments:**
 
@@ -82,10 +83,25 @@ class Refits(eqx.Module):
         gained = score_of(before).value - score_of(best).value
         if len(starts) == 1 and not promised / _FAR < gained < promised * _FAR:
             best = self.best([best, self.filtered(self.unfiltered(loop, noise).loop, noise)])
+            gained = score_of(before).value - score_of(best).value
+        if len(effects) > 1 and gained < promised / _FAR:
+            best = self.best([best, self.filtered(self.in_turn(before, effects, noise), noise)])
         loose = [name for name in held if name not in best.loop.names]
         if loose:
             best = self.best([best, self.filtered(best.loop.free(*loose), noise)])
         return best
+
+    def in_turn(
+        self, before: Fit, effects: Sequence[AbstractEffect], noise: Sequence[ARFilter]
+    ) -> ClosedLoop:
+        """A loop with additional effects, of which each is fitted before the next is added.
+
+        Two large effects at once may be too far from the minimum for a fit to converge.
+        """
+        loop = before.loop
+        for effect in effects:
+            loop = self.unfiltered(of_one_sign(loop.add(_inside(effect))), noise).loop
+        return loop
 
     def unfiltered(self, loop: ClosedLoop, noise: Sequence[ARFilter]) -> Fit:
         """The fit of the loop under the assumption of white noise.
@@ -121,23 +137,6 @@ def held_shapes(loop: ClosedLoop, last: int) -> tuple[str, ...]:
         and isinstance(loop.effects[int(p.place[1])], AbstractTransmission)
         and not p.declaration.free
     )
-
-
-def of_one_sign(loop: ClosedLoop) -> ClosedLoop:
-    """The loop with one smoothing per joint, if that of its Coulomb friction is estimated.
-
-    Effects are added with the current smoothing, and the refit may change that of the friction.
-    """
-    estimated, held = {}, []
-    for p in loop.parameters:
-        if p.place[0] != "effects" or p.place[2:] != ("smoothing",):
-            continue
-        effect: Any = loop.effects[int(p.place[1])]
-        if isinstance(effect, Coulomb) and p.name in loop.names:
-            estimated[effect.joint] = float(effect.smoothing)
-        elif p.name not in loop.names:
-            held.append((p.name, getattr(effect, "joint", None)))
-    return loop.with_values(**{name: estimated[j] for name, j in held if j in estimated})
 
 
 def _inside(effect: AbstractEffect) -> AbstractEffect:

@@ -25,6 +25,8 @@ NOBODY = 0
 _SHARP = 1e-30
 # Argument at which a hyperbolic tangent is 1/2.
 _HALF = math.atanh(0.5)
+# Slope of x / (1 + x⁸)^(1/8) at which it is 1/2 at x = 1.
+_CORNER = 255**-0.125
 
 
 def recording_label(name: str) -> int:
@@ -41,7 +43,8 @@ class Motion(eqx.Module):
     the drives, and `load` is the torque that the links need without accelerating (None for other
     effects). `state` contains the effect's own states. `label` identifies the recording
     (`recording_label`). `held` has the recording's signals that are constant from sample to
-    sample, by name (`on`, `supply`).
+    sample, by name (`on`, `supply`). `imposed` is true if the motion does not follow from the
+    torque (unknown law); `a` is then the acceleration, for every effect.
     """
 
     t: Float[Array, ""]
@@ -53,6 +56,7 @@ class Motion(eqx.Module):
     label: Int[Array, ""]
     held: dict[str, Float[Array, " joints"]] = eqx.field(default_factory=dict)
     load: Float[Array, " joints"] | None = None
+    imposed: bool = eqx.field(static=True, default=False)
 
 
 class AbstractEffect(eqx.Module):
@@ -238,13 +242,22 @@ def smooth_sign(
     - `v`: rad/s or m/s. `smoothing`: the speed at which the result is 1/2, which is 1/gamma of
       Brunot et al. 2016; zero gives the sign itself.
     - `form`: shape of the function, which is 1/2 at the same speed for all: 0 for the arctan, 1/2
-      for x / sqrt(3 + x²), 1 for the hyperbolic tangent, and parabolic interpolation between
-      these, which exceeds one by at most 0.002.
+      for x / sqrt(3 + x²), 1 for the hyperbolic tangent, 3/2 for a ramp with rounded corners, and
+      cubic interpolation between these, which exceeds one by at most 0.004.
     """
     x = v / (smoothing + _SHARP)
     slow = 2 / jnp.pi * jnp.arctan(x)
     if form is None:
         return slow
     root = x / jnp.sqrt(3 + x**2)
-    shares = (1 - form) * (1 - 2 * form), 4 * form * (1 - form), form * (2 * form - 1)
-    return shares[0] * slow + shares[1] * root + shares[2] * jnp.tanh(_HALF * x)
+    ramp = _CORNER * x
+    ramp = ramp / jnp.sqrt(jnp.sqrt(jnp.sqrt(1 + ramp**8)))
+    n = 2 * form
+    shares = (
+        (1 - n) * (2 - n) * (3 - n) / 6,
+        n * (2 - n) * (3 - n) / 2,
+        n * (n - 1) * (3 - n) / 2,
+        n * (n - 1) * (n - 2) / 6,
+    )
+    forms = slow, root, jnp.tanh(_HALF * x), ramp
+    return sum((s * f for s, f in zip(shares, forms, strict=True)), jnp.zeros(()))

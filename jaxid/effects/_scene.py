@@ -11,7 +11,7 @@ class Scene(eqx.Module):
     """Ranges of the recorded motion, one value for each joint, in SI units.
 
     - `q_low`, `q_high`: range of position. `speed`, `torque`: largest magnitudes.
-    - `inertia`: mean inertia of a joint while the others are free. `smoothing`: smoothing of the
+    - `inertia`: mean inertia of a joint while the others are free. `smoothing`, `form`: of the
       sign in its Coulomb friction.
     - `period`, `duration`: of the recordings, s. `recordings`: their names.
     - `tones`: frequencies of peaks in the residual's spectrum, Hz.
@@ -30,6 +30,7 @@ class Scene(eqx.Module):
     torque: Float[np.ndarray, " joints"]
     inertia: Float[np.ndarray, " joints"]
     smoothing: Float[np.ndarray, " joints"]
+    form: Float[np.ndarray, " joints"]
     period: float
     duration: float
     recordings: tuple[str, ...]
@@ -52,6 +53,9 @@ class Scene(eqx.Module):
         """Range of a joint's position, rad or m."""
         return float(self.q_high[joint - 1] - self.q_low[joint - 1])
 
-    def smoothed(self, joint: int) -> float:
-        """Speed at which the smoothed sign of a joint is 1/2, rad/s or m/s."""
-        return float(self.smoothing[joint - 1])
+    def sign(self, joint: int) -> dict[str, float]:
+        """Smoothing, rad/s or m/s, and form of the sign in the Coulomb friction of a joint."""
+        return {
+            "smoothing": float(self.smoothing[joint - 1]),
+            "form": float(self.form[joint - 1]),
+        }

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from ..parameters import Scalar, as_float64, parameter
 from ._base import AbstractEffect, Motion, smooth_sign
 from ._scene import Scene
-from .friction import smoothing_speed
+from .friction import sign_form, smoothing_speed
 
 
 class SharedShaft(AbstractEffect):
@@ -33,14 +33,14 @@ class SharedShaft(AbstractEffect):
     inertia: Scalar = parameter(0.0, symbol="Ias", unit="kg·m²", lower=0.0, scale=0.01)
     share: Scalar = eqx.field(converter=as_float64, default=1.0)
     smoothing: Scalar = smoothing_speed()
+    form: Scalar = sign_form()
     inertial = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["SharedShaft"]:
         """The pairs of joints that gears couple, or may couple."""
         return [
-            cls(joint=i, driven=j, share=share, smoothing=scene.smoothed(j))
-            for i, j, share in scene.couplings
+            cls(joint=i, driven=j, share=share, **scene.sign(j)) for i, j, share in scene.couplings
         ]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
@@ -48,5 +48,7 @@ class SharedShaft(AbstractEffect):
         way = jnp.zeros_like(motion.v).at[self.joint - 1].set(self.share)
         way = way.at[self.driven - 1].add(1.0)
         speed, rate = way @ motion.v, way @ motion.a
-        friction = self.viscous * speed + self.coulomb * smooth_sign(speed, self.smoothing)
+        friction = self.viscous * speed + self.coulomb * smooth_sign(
+            speed, self.smoothing, self.form
+        )
         return way * (friction + self.inertia * rate)

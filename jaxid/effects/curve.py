@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..parameters import Scalar, as_float64, parameter
 from ._base import AbstractEffect, Motion, on_joint, smooth_sign
-from .friction import smoothing_speed
+from .friction import sign_form, smoothing_speed
 
 Coordinate = Literal["q", "v", "a", "tau", "t"]
 
@@ -34,6 +34,7 @@ class Curve(AbstractEffect):
     signed: bool = eqx.field(static=True, default=False)
     coefficients: Float[Array, " knots"] = parameter((0.0,) * 12, symbol="s", unit="N·m", scale=0.1)
     smoothing: Scalar = smoothing_speed()
+    form: Scalar = sign_form()
     needs_acceleration = True
 
     @property
@@ -62,7 +63,7 @@ class Curve(AbstractEffect):
         x = motion.t if self.coordinate == "t" else getattr(motion, self.coordinate)[self.of - 1]
         value = self.value(x)
         if self.signed:
-            value = value * smooth_sign(motion.v[self.joint - 1], self.smoothing)
+            value = value * smooth_sign(motion.v[self.joint - 1], self.smoothing, self.form)
         return on_joint(self.joint, value, motion)
 
 

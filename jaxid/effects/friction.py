@@ -23,6 +23,13 @@ def smoothing_speed() -> Any:
     )
 
 
+def sign_form() -> Any:
+    """A field for the form of a smoothed sign (`smooth_sign`): 0, the arctan, to 3/2, a ramp."""
+    return parameter(
+        0.0, symbol="form", unit="1", lower=0.0, upper=1.5, scale=1.0, free=False, linear=False
+    )
+
+
 class Viscous(AbstractEffect):
     """Friction proportional to velocity: Fv v."""
 
@@ -38,22 +45,32 @@ class Viscous(AbstractEffect):
 class Coulomb(AbstractEffect):
     """Dry friction, smoothed: Fc sigma(v), sigma = 2/pi arctan(v/eps) (Brunot et al. 2016).
 
-    `form` selects the function: the arctan at 0, (v/eps) / sqrt(3 + (v/eps)²) at 1/2, and
-    tanh(v/eps · artanh(1/2)) at 1, which approaches the sign fastest. For all of them sigma is 1/2
-    at v = eps.
+    `form` selects the function: the arctan at 0, (v/eps) / sqrt(3 + (v/eps)²) at 1/2,
+    tanh(v/eps · artanh(1/2)) at 1, and v/(2 eps) up to rounded corners at 3/2. For all of them
+    sigma is 1/2 at v = eps.
+
+    `lead` is the time by which friction precedes velocity: sigma(v + lead a). That of real
+    friction is zero. The dry friction of simulators with soft constraints depends on the velocity
+    that the joint would reach: MuJoCo's `frictionloss` has a lead of dmax · timeconst / 2, 9.5 ms
+    by default (MuJoCo documentation, "Solver parameters"). It acts only along an imposed motion
+    (unknown law), where acceleration is known.
     """
 
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     level: Scalar = parameter(0.0, symbol="Fc", unit="N·m", lower=0.0, scale=0.1)
     smoothing: Scalar = smoothing_speed()
-    form: Scalar = parameter(
-        0.0, symbol="form", unit="1", lower=0.0, upper=1.0, scale=1.0, free=False, linear=False
+    form: Scalar = sign_form()
+    lead: Scalar = parameter(
+        0.0, symbol="lead", unit="s", lower=0.0, upper=0.05, scale=0.01, free=False, linear=False
     )
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """Fc sigma(v) on the joint, `(joints,)`."""
-        sign = smooth_sign(motion.v[self.joint - 1], self.smoothing, self.form)
+        v = motion.v[self.joint - 1]
+        if motion.imposed:
+            v = v + self.lead * motion.a[self.joint - 1]
+        sign = smooth_sign(v, self.smoothing, self.form)
         return on_joint(self.joint, self.level * sign, motion)
 
 
@@ -67,6 +84,7 @@ class Stribeck(AbstractEffect):
         0.1, symbol="vs", unit="rad/s", lower=1e-4, scale=0.1, linear=False
     )
     smoothing: Scalar = smoothing_speed()
+    form: Scalar = sign_form()
 
     @classmethod
     def spoken(cls) -> str:
@@ -78,7 +96,7 @@ class Stribeck(AbstractEffect):
         """Velocities from a fiftieth to a half of the highest speed."""
         shares = np.geomspace(0.02, 0.5, 7)
         return [
-            cls(joint=j, velocity=share * scene.speed[j - 1], smoothing=scene.smoothed(j))
+            cls(joint=j, velocity=share * scene.speed[j - 1], **scene.sign(j))
             for j in scene.joints
             for share in shares
         ]
@@ -87,7 +105,9 @@ class Stribeck(AbstractEffect):
         """Fs exp(-(v/vs)²) sigma(v) on the joint, `(joints,)`."""
         v = motion.v[self.joint - 1]
         fall = jnp.exp(-((v / self.velocity) ** 2))
-        return on_joint(self.joint, self.level * fall * smooth_sign(v, self.smoothing), motion)
+        return on_joint(
+            self.joint, self.level * fall * smooth_sign(v, self.smoothing, self.form), motion
+        )
 
 
 class AsymmetricFriction(AbstractEffect):
@@ -101,16 +121,17 @@ class AsymmetricFriction(AbstractEffect):
     viscous: Scalar = parameter(0.0, symbol="dFv", unit="N·m·s/rad", scale=0.05)
     coulomb: Scalar = parameter(0.0, symbol="dFc", unit="N·m", scale=0.1)
     smoothing: Scalar = smoothing_speed()
+    form: Scalar = sign_form()
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["AsymmetricFriction"]:
         """Every joint."""
-        return [cls(joint=j, smoothing=scene.smoothed(j)) for j in scene.joints]
+        return [cls(joint=j, **scene.sign(j)) for j in scene.joints]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """(dFv v + dFc sigma(v)) sigma(v) on the joint, `(joints,)`."""
         v = motion.v[self.joint - 1]
-        sign = smooth_sign(v, self.smoothing)
+        sign = smooth_sign(v, self.smoothing, self.form)
         return on_joint(self.joint, (self.viscous * v + self.coulomb * sign) * sign, motion)
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from ..parameters import Scalar, parameter
 from ._base import AbstractEffect, Motion, on_joint, smooth_sign
 from ._scene import Scene
-from .friction import smoothing_speed
+from .friction import sign_form, smoothing_speed
 
 
 class GearFriction(AbstractEffect):
@@ -47,16 +47,14 @@ class GearFriction(AbstractEffect):
         2.0, symbol="power", unit="1", lower=0.1, upper=4.0, scale=1.0, free=False, linear=False
     )
     smoothing: Scalar = smoothing_speed()
-    form: Scalar = parameter(
-        0.0, symbol="form", unit="1", lower=0.0, upper=1.0, scale=1.0, free=False, linear=False
-    )
+    form: Scalar = sign_form()
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["GearFriction"]:
         """Some ratios for both sides, and one that is twice as high below some velocities."""
         made = []
         for j in scene.joints:
-            own = {"joint": j, "smoothing": scene.smoothed(j)}
+            own = {"joint": j, **scene.sign(j)}
             made += [cls(drive=ratio, **own) for ratio in (0.05, 0.1, 0.2)]
             made += [
                 cls(drive=0.1, slow=0.1, velocity=share * scene.speed[j - 1], **own)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from ..parameters import Scalar, as_float64, parameter
 from ._base import AbstractEffect, Motion, on_joint, smooth_sign
 from ._scene import Scene
-from .friction import smoothing_speed
+from .friction import sign_form, smoothing_speed
 
 
 class LoadDependentFriction(AbstractEffect):
@@ -24,17 +24,18 @@ class LoadDependentFriction(AbstractEffect):
     joint: int = eqx.field(static=True)
     ratio: Scalar = parameter(0.0, symbol="alpha", unit="1", lower=0.0, upper=0.95, scale=0.1)
     smoothing: Scalar = smoothing_speed()
+    form: Scalar = sign_form()
     loaded = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["LoadDependentFriction"]:
         """Every joint."""
-        return [cls(joint=j, smoothing=scene.smoothed(j)) for j in scene.joints]
+        return [cls(joint=j, **scene.sign(j)) for j in scene.joints]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """alpha |tau_link| sigma(v) on the joint, `(joints,)`."""
         j = self.joint - 1
-        share = self.ratio * smooth_sign(motion.v[j], self.smoothing)
+        share = self.ratio * smooth_sign(motion.v[j], self.smoothing, self.form)
         available = motion.tau[j]
         link = jnp.abs(available) / (1 + share * jnp.sign(available))
         return on_joint(self.joint, share * link, motion)
@@ -54,6 +55,7 @@ class PositionDependentFriction(AbstractEffect):
     A2: Scalar = parameter(0.0, symbol="FA2_", unit="N·m", scale=0.1)
     B2: Scalar = parameter(0.0, symbol="FB2_", unit="N·m", scale=0.1)
     smoothing: Scalar = smoothing_speed()
+    form: Scalar = sign_form()
     # Not static: programs would depend on it, and it varies with the simulated travel.
     turn: Scalar = eqx.field(converter=as_float64, default=2 * np.pi)
 
@@ -63,7 +65,7 @@ class PositionDependentFriction(AbstractEffect):
         return [
             cls(
                 joint=j,
-                smoothing=scene.smoothed(j),
+                **scene.sign(j),
                 turn=2 * scene.travel(j) if scene.slides[j - 1] else 2 * np.pi,
             )
             for j in scene.joints
@@ -75,7 +77,9 @@ class PositionDependentFriction(AbstractEffect):
         angle = 2 * jnp.pi / self.turn * motion.q[j]
         wave = self.A1 * jnp.cos(angle) + self.B1 * jnp.sin(angle)
         wave = wave + self.A2 * jnp.cos(2 * angle) + self.B2 * jnp.sin(2 * angle)
-        return on_joint(self.joint, wave * smooth_sign(motion.v[j], self.smoothing), motion)
+        return on_joint(
+            self.joint, wave * smooth_sign(motion.v[j], self.smoothing, self.form), motion
+        )
 
 
 # A lubricant takes minutes to warm. Torque that fades within a second, s, has another cause.
@@ -93,12 +97,13 @@ class ThermalDrift(AbstractEffect):
         10.0, symbol="T", unit="s", lower=_FASTEST, scale=10.0, linear=False
     )
     smoothing: Scalar = smoothing_speed()
+    form: Scalar = sign_form()
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["ThermalDrift"]:
         """Time constants from a twentieth of the recordings to twice their length."""
         return [
-            cls(joint=j, time_constant=time, smoothing=scene.smoothed(j))
+            cls(joint=j, time_constant=time, **scene.sign(j))
             for j in scene.joints
             for time in scene.duration * np.geomspace(0.06, 1.5, 5)
             if time > _FASTEST
@@ -107,7 +112,7 @@ class ThermalDrift(AbstractEffect):
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """The fading part of friction on the joint, `(joints,)`."""
         v = motion.v[self.joint - 1]
-        friction = self.viscous * v + self.coulomb * smooth_sign(v, self.smoothing)
+        friction = self.viscous * v + self.coulomb * smooth_sign(v, self.smoothing, self.form)
         return on_joint(self.joint, friction * jnp.exp(-motion.t / self.time_constant), motion)
 
 

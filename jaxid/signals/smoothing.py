@@ -87,9 +87,11 @@ def signal_cutoff(recording: Recording) -> float:
     """The frequency in Hz above which a recorded motion does not determine acceleration.
 
     The spectrum of the acceleration, f⁴ times that of position, decreases until the encoder's noise
-    raises it again. The result is its minimum, summed over joints relative to their speed. It is at
-    least five times the frequency of largest speed and at most an eighth of the sample rate. For
-    recordings too short for a spectrum it is a tenth of the sample rate.
+    raises it again. The result is its minimum, summed over joints relative to their speed. Of
+    minima of about the same level the last is chosen, because another one may be between the
+    frequencies of the reference and those of the loop's response to friction. It is at least five
+    times the frequency of largest speed and at most an eighth of the sample rate. For recordings
+    too short for a spectrum it is a tenth of the sample rate.
     """
     import scipy
 
@@ -113,8 +115,20 @@ def signal_cutoff(recording: Recording) -> float:
     centre = np.array([f[low:high].mean() for low, high in bands])
     level = np.array([acceleration[low:high].mean() for low, high in bands])
     least = 5 * centre[int(np.argmax(level / centre**2))]
-    allowed = np.where(centre >= least, level, np.inf)
-    return float(min(max(least, centre[int(np.argmin(allowed))]), rate / 8))
+    cutoff = centre[_last_minimum(level, centre >= least)]
+    return float(min(max(least, cutoff), rate / 8))
+
+
+# Ratio of the levels of two bands that may be random: a band at low frequencies has few lines.
+_TIED = 1.5
+
+
+def _last_minimum(level: Float[np.ndarray, " bands"], allowed: Bool[np.ndarray, " bands"]) -> int:
+    """The band of the lowest level; of minima that are tied, that of the highest frequency."""
+    lowest = int(np.argmin(np.where(allowed, level, np.inf)))
+    inner = np.flatnonzero((level[1:-1] < level[:-2]) & (level[1:-1] < level[2:])) + 1
+    tied = inner[allowed[inner] & (level[inner] <= _TIED * level[lowest])]
+    return max([lowest, *tied.tolist()])
 
 
 class Band(eqx.Module):

@@ -232,7 +232,8 @@ def _along_reference(
     at = seen.q - noise.q, seen.v - noise.v
     rates = seen.v - noise.v, reference.a - outside.noise_rate
     (q, v), (_, a) = jax.jvp(lambda q, v: behind(loop, q, v), at, rates)
-    motion = Motion(t, q, v, a, jnp.zeros_like(q), jnp.zeros(0), label, reference.held)
+    still, none = jnp.zeros_like(q), jnp.zeros(0)
+    motion = Motion(t, q, v, a, still, none, label, reference.held, imposed=True)
     rigid = loop.arm.inverse(q, v, a)
     tau = rigid + _beside_bodies(loop, motion, state, rigid, outside)
     command = _commanded(loop, motion, tau) + reference.tau

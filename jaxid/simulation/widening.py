@@ -5,10 +5,13 @@ import dataclasses
 import numpy as np
 from jaxtyping import Int
 
+from .dynamics import imposed
 from .loop import ClosedLoop
 
-# Fields of a smoothed sign, which a search holds at first and may estimate later.
+# Fields of a smoothed sign, which a search holds at first and may estimate later. The third acts
+# only along an imposed motion.
 SIGN = "smoothing", "form"
+LEAD = "lead"
 
 
 def widened(loop: ClosedLoop) -> tuple[ClosedLoop, Int[np.ndarray, " own"]]:
@@ -19,7 +22,8 @@ def widened(loop: ClosedLoop) -> tuple[ClosedLoop, Int[np.ndarray, " own"]]:
 
     **Returns:** the widened loop, and the indices of the values of `loop.theta` in its `theta`.
     """
-    signs = {p.place for p in loop.parameters if p.place[-1] in SIGN}
+    fields = (*SIGN, LEAD) if imposed(loop) else SIGN
+    signs = {p.place for p in loop.parameters if p.place[-1] in fields}
     wide = dataclasses.replace(loop, held=loop.held - signs, freed=loop.freed | signs)
     own = {p.place for p in loop.free_parameters}
     return wide, np.flatnonzero(

@@ -1,0 +1,45 @@
+"""Shapes of the smoothed signs of a loop's frictions; those of one joint are the same."""
+
+from typing import Any
+
+import numpy as np
+
+from ..effects import AbstractEffect, Coulomb
+from ..parameters import Parameter
+from ..simulation.loop import ClosedLoop
+from ..simulation.widening import SIGN
+
+# Ends of the places of the shapes of an effect's sign.
+OF_SIGN = {(what,) for what in SIGN}
+
+
+def of_one_sign(loop: ClosedLoop) -> ClosedLoop:
+    """The loop with one sign per joint, where shapes of that of its Coulomb friction are estimated.
+
+    Effects are added with the current shapes, and the refit may change those of the friction.
+    """
+    estimated, held = {}, []
+    for p in loop.parameters:
+        if p.place[0] != "effects" or p.place[2:] not in OF_SIGN:
+            continue
+        effect = loop.effects[int(p.place[1])]
+        own = _joint_of_sign(effect), p.place[-1]
+        if isinstance(effect, Coulomb) and p.name in loop.names:
+            estimated[own] = float(np.asarray(p.where(loop)))
+        elif p.name not in loop.names:
+            held.append((p.name, own))
+    return loop.with_values(**{name: estimated[own] for name, own in held if own in estimated})
+
+
+def follows(p: Parameter, loop: ClosedLoop) -> bool:
+    """Whether a parameter is a shape of a sign that follows the joint's Coulomb friction."""
+    if p.place[0] != "effects" or p.place[2:] not in OF_SIGN:
+        return False
+    effect = loop.effects[int(p.place[1])]
+    leading = {e.joint for e in loop.effects if isinstance(e, Coulomb)}
+    return not isinstance(effect, Coulomb) and _joint_of_sign(effect) in leading
+
+
+def _joint_of_sign(effect: AbstractEffect) -> Any:
+    """The joint whose direction a friction has; for a shared shaft, the one that it drives."""
+    return getattr(effect, "driven", getattr(effect, "joint", None))
