@@ -28,8 +28,8 @@ def remarks(steps: Sequence[Step], given: ClosedLoop) -> tuple[str, ...]:
 
 # What the lead of a friction means.
 _LEADS = (
-    "; friction that precedes velocity is that of a simulator with soft constraints, and "
-    "simulations of a control law do not include the lead"
+    "; friction of simulators with soft constraints precedes velocity, that of real joints does "
+    "not: on a measured arm something else is missing (simulations of a law ignore the lead)"
 )
 # Deviations between an estimate and the default value that it contradicts.
 _APART = 3.0

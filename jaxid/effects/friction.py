@@ -62,7 +62,7 @@ class Coulomb(AbstractEffect):
     smoothing: Scalar = smoothing_speed()
     form: Scalar = sign_form()
     lead: Scalar = parameter(
-        0.0, symbol="lead", unit="s", lower=0.0, upper=0.05, scale=0.01, free=False, linear=False
+        0.0, symbol="lead", unit="s", lower=0.0, upper=0.02, scale=0.01, free=False, linear=False
     )
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
