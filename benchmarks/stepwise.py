@@ -17,6 +17,7 @@ from scipy import stats
 
 import jaxid
 from jaxid import effects as fx
+from jaxid.discovery.signs import shapes_of_signs
 from jaxid.effects import recording_label
 from jaxid.errors import FitError
 from jaxid.estimate.regression import decimator, filtered, linear_parameters, regression
@@ -178,20 +179,13 @@ def survey(
         np.concatenate([np.asarray(getattr(m, n)) for m in motions]) for n in ["q", "v", "tau"]
     )
     mass = np.asarray(jax.vmap(loop.arm.mass_matrix)(jnp.asarray(q[::50])))
-    signs = {
-        e.joint: (float(e.smoothing), float(e.form))
-        for e in loop.effects
-        if isinstance(e, fx.Coulomb)
-    }
-    smoothing, form = np.array([signs.get(j, (0.01, 0.0)) for j in range(1, loop.joints + 1)]).T
     return fx.Scene(
         q.min(axis=0),
         q.max(axis=0),
         np.abs(v).max(axis=0),
         np.abs(tau).max(axis=0),
         np.einsum("kjj->j", mass) / len(mass),
-        smoothing,
-        form,
+        *shapes_of_signs(loop),
         float(np.median([r.period for r in recordings])),
         float(max(r.duration for r in recordings)),
         tuple(recordings.names),

@@ -11,13 +11,14 @@ from jaxtyping import Array, Float
 
 from ..arms import AbstractArm
 from ..compiling import compiled
-from ..effects import AbstractEffect, Coulomb, Curve, Motion, Scene, check_declared
+from ..effects import AbstractEffect, Curve, Motion, Scene, check_declared
 from ..effects import catalogue as known
 from ..effects.curve import curve_over
 from ..errors import FitError, ModelError
 from ..parameters import Parameter, list_parameters
 from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
+from .signs import shapes_of_signs
 
 
 class Hypothesis(eqx.Module):
@@ -80,10 +81,6 @@ def survey(
     q = np.asarray(motion.q).reshape(-1, loop.joints)
     low, high = q.min(axis=0), q.max(axis=0)
     speed = np.abs(np.asarray(motion.v)).reshape(-1, loop.joints).max(axis=0)
-    signs = {
-        e.joint: (float(e.smoothing), float(e.form)) for e in loop.effects if isinstance(e, Coulomb)
-    }
-    smoothing, form = np.array([signs.get(j, (0.01, 0.0)) for j in range(1, loop.joints + 1)]).T
     return Scene(
         low,
         # A joint at rest gets a small travel, because shapes are shares of it.
@@ -91,8 +88,7 @@ def survey(
         np.maximum(speed, 1e-6),
         np.abs(np.asarray(motion.tau)).reshape(-1, loop.joints).max(axis=0),
         _inertia(loop, q),
-        smoothing,
-        form,
+        *shapes_of_signs(loop),
         float(np.median([r.period for r in recordings])),
         float(max(r.duration for r in recordings)),
         tuple(recordings.names),

@@ -1,4 +1,4 @@
-"""Release of values that a model holds by default: a smoothing, the delay of recorded torque."""
+"""Release of values held by default: shapes of a sign, a lead of friction, a delay of torque."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ..effects import AbstractEffect, Coulomb
 from ..parameters import Parameter
@@ -11,6 +12,19 @@ from ..simulation.widening import SIGN
 
 # Ends of the places of the shapes of an effect's sign.
 OF_SIGN = {(what,) for what in SIGN}
+# Smoothing, rad/s or m/s, and form of the sign of a joint without Coulomb friction.
+_DEFAULT = 0.01, 0.0
+
+
+def shapes_of_signs(
+    loop: ClosedLoop,
+) -> tuple[Float[np.ndarray, " joints"], Float[np.ndarray, " joints"]]:
+    """Smoothing, rad/s or m/s, and form of the sign in the Coulomb friction of each joint."""
+    known = {
+        e.joint: (float(e.smoothing), float(e.form)) for e in loop.effects if isinstance(e, Coulomb)
+    }
+    smoothing, form = np.array([known.get(j, _DEFAULT) for j in range(1, loop.joints + 1)]).T
+    return smoothing, form
 
 
 def of_one_sign(loop: ClosedLoop) -> ClosedLoop:

@@ -8,9 +8,9 @@ from jaxtyping import Int
 from .dynamics import imposed
 from .loop import ClosedLoop
 
-# Fields of a smoothed sign, which a search holds at first and may estimate later. The third acts
-# only along an imposed motion.
+# Fields of a smoothed sign, which a search holds at first and may estimate later.
 SIGN = "smoothing", "form"
+# The lead of Coulomb friction, of which the same is true; it acts only along an imposed motion.
 LEAD = "lead"
 
 
