@@ -18,6 +18,7 @@ from jaxid.discovery.bounded import bounded_amplitudes
 from jaxid.discovery.explore import Candidate, _fitted, _plain, key_of
 from jaxid.discovery.hypotheses import Hypothesis
 from jaxid.discovery.landscape import Entry, shares_a_joint
+from jaxid.discovery.last_tries import replaced
 from jaxid.discovery.likelihood import price, score, weights
 from jaxid.discovery.models import Model, Visited, probability
 from jaxid.discovery.score import Data
@@ -182,11 +183,11 @@ def test_what_shares_the_weight_is_alike(offset_story):
 @pytest.mark.xdist_group("offset")
 def test_superfluous_effect_is_taken_out_and_a_needed_one_stays(offset_case, offset_story):
     search, start = search_of(offset_case), offset_story[0].steps[0]
-    search._visit((), start.fit)
+    search.visit((), start.fit)
     offset, drag = TorqueOffset(joint=2), QuadraticDrag(joint=1)
     for effects in ((drag, offset), (offset, drag)):
         last = with_chain(offset_case, start, *effects)[-1].fit
-        at = search._visit(search._added(last), last)
+        at = search.visit(search.added(last), last)
         left = search._without_one(at)
         assert left is not None
         assert left.names == (("torque_offset", 2),)
@@ -198,9 +199,9 @@ def test_an_effect_that_was_too_small_is_not_added_again(offset_case, offset_sto
     """Its prediction may be larger than its fit, so that a search would never end."""
     monkeypatch.setattr("jaxid.discovery.search.needed", lambda *_: False)
     search, start = search_of(offset_case), offset_story[0].steps[0]
-    start_model = search._visit((), start.fit)
+    start_model = search.visit((), start.fit)
     last = with_chain(offset_case, start, TorqueOffset(joint=2))[-1].fit
-    at = search._visit(search._added(last), last)
+    at = search.visit(search.added(last), last)
     asked, search.asked = search.asked, dataclasses.replace(search.asked, worth=50.0)
     assert search._without_one(at).names == ()
     search.asked = asked
@@ -213,19 +214,19 @@ def test_an_effect_that_was_too_small_is_not_added_again(offset_case, offset_sto
 def test_a_close_rival_that_was_only_predicted_is_fitted(offset_case, offset_story):
     """A weak spring in the place of the offset; the prediction puts the offset slightly behind."""
     search, start = search_of(offset_case), offset_story[0].steps[0]
-    search._visit((), start.fit)
+    search.visit((), start.fit)
     last = with_chain(offset_case, start, Spring(joint=2, stiffness=0.01))[-1].fit
-    at = search._visit(search._added(last), last)
+    at = search.visit(search.added(last), last)
     offset = (TorqueOffset(joint=2, level=0.01),)
     search.visited.add(Model(offset, at.score + 20.0, noise=at.noise, beyond=1))
-    assert search._replaced(at) is None
+    assert replaced(search, at) is None
     search.visited.add(Model(offset, at.score + 5.0, noise=at.noise, beyond=1))
-    found = search._replaced(at)
+    found = replaced(search, at)
     assert found is not None
     assert found.names == (("torque_offset", 2),)
     assert found.score < at.score - 5
     # It was fitted, so it is not tried again.
-    assert search._replaced(found) is None
+    assert replaced(search, found) is None
 
 
 @pytest.mark.xdist_group("offset")

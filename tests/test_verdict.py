@@ -82,6 +82,16 @@ def test_what_held_out_recordings_say_of_an_effect_is_told(found):
     assert story.to_dict()["added"][0]["held_out"] == "raises"
 
 
+def test_an_effect_that_lowers_one_error_and_raises_another_is_neither(found, offset_case):
+    first, noise = found.steps[0].held_out, found.diagnosis.noise
+    # The effect lowers the error of joint 2, and a torque is added to joint 1.
+    after = jaxid.compare(found.fit, louder(recordings_of(offset_case)[1][0], 1, 0.2))
+    assert on_unseen(first, after, noise, WORTH) == "mixed"
+    step = dataclasses.replace(found.steps[-1], unseen="mixed")
+    assert "raises others" in step.belief()
+    assert "others" not in step.belief(tested=False)
+
+
 def test_a_fit_that_failed_is_no_verdict(found):
     status = jaxid.Status.misfit
     assert "check the units" in asked(found, dataclasses.replace(found.fit, status=status))

@@ -136,7 +136,7 @@ def _told(
     reason = _STOPPED if interrupted else _raised(search, steps)
     if not unfinished and not reason:
         reason = _doubt(search, verdict, steps, models)
-    notes = (*remarks(steps, search.given), *search.failures)
+    notes = (*remarks(steps, search.given, search.offsets), *search.failures)
     if unfinished:
         notes = (f"stopped at the limit of {search.asked.most} effects: raise most", *notes)
     return Discovery(
@@ -192,7 +192,7 @@ def _raised(search: Search, steps: Sequence[Step]) -> str:
     noise, worth = search.at.noise, search.asked.worth
     if len(seen) < 2 or not (reason := risen(seen[0], seen[-1], noise, worth)):
         return ""
-    culprits = [s for s in steps if s.unseen == "raises"]
+    culprits = [s for s in steps if s.unseen in ("raises", "mixed")]
     # The names of all added effects would not add to the reason.
     some = 0 < len(culprits) < len(seen) - 1
     said = f"; it rose with {joined([s.label.removeprefix('+ ') for s in culprits])}"

@@ -9,6 +9,7 @@ from ..noise import ARFilter
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
 from .models import piece_name
+from .offsets import held_offsets
 from .release import Release
 from .verify import Refits
 
@@ -101,14 +102,15 @@ class Fits:
         return self._saved(name, loop, better)
 
     def _saved(self, name: str, loop: ClosedLoop, work: Callable[[], Fit]) -> Fit:
-        """A fit under a name that contains the released values of its loop.
+        """A fit under a name that contains the released values and the held offsets of its loop.
 
         **Arguments:**
 
         - `loop`: the loop before the fit.
         """
         late = getattr(loop.controller, "delay", 0.0)
-        parts = [*(f"{x} free" for x in sorted(released_names(loop)))]
+        parts = [f"{x} free" for x in sorted(released_names(loop))]
+        parts += [f"{x} held" for x in held_offsets(loop)]
         parts += [f"delay {late:.9g}"] if late else []
         return self._campaign.piece(", ".join([f"{self._prefix}{name}", *parts]), work)
 

@@ -1,28 +1,35 @@
 """Notes on a discovery in addition to its verdict."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..effects import ActuatorLag, TimeDelay
+from ..effects import AbstractEffect, ActuatorLag, TimeDelay
 from ..estimate import Fit
 from ..estimate.standstill import slow_note
 from ..simulation.loop import ClosedLoop
 from ..simulation.widening import LEAD
+from .hypotheses import effect_on
+from .models import named
+from .offsets import held_offsets
 from .step import Step
 
 
-def remarks(steps: Sequence[Step], given: ClosedLoop) -> tuple[str, ...]:
-    """Notes on failed fits, released values, slow motion and an undeclared sampled law.
+def remarks(
+    steps: Sequence[Step], given: ClosedLoop, offsets: Mapping[str, AbstractEffect]
+) -> tuple[str, ...]:
+    """Notes on failed fits, released values, offsets, slow motion and an undeclared sampled law.
 
     **Arguments:**
 
     - `given`: the starting loop of the discovery.
+    - `offsets`: names of offsets, each with the effect that explains the recordings in its place.
     """
     bad = [s.label for s in steps if not s.fit.succeeded]
     said = [f"the fit of {', '.join(bad)} did not converge: use its values with care"]
     last = steps[-1].fit
-    more = (*_estimated(last, given), *slow_note(given.standstill, last.loop), *looks_sampled(last))
+    more = (*_estimated(last, given), *_instead(last, given, offsets))
+    more = (*more, *slow_note(given.standstill, last.loop), *looks_sampled(last))
     return (*(said if bad else ()), *more)
 
 
@@ -63,6 +70,25 @@ def _estimated(fit: Fit, given: ClosedLoop) -> list[str]:
             f"the recorded torque is estimated to act {1e3 * abs(after):.3g} ms {way} than "
             "recorded; for a sampled law whose torque is held, it acts half a period later"
         )
+    return found
+
+
+def _instead(fit: Fit, given: ClosedLoop, offsets: Mapping[str, AbstractEffect]) -> list[str]:
+    """Notes on offsets that may be friction that differs by direction."""
+    found = [
+        f"{name} was left out: friction that differs by direction is in its place, which has a "
+        "lower score"
+        for name in held_offsets(fit.loop)
+        if name not in held_offsets(given)
+    ]
+    for name, effect in offsets.items():
+        if name in fit.loop.names:
+            row = fit.table().loc[name]
+            found.append(
+                f"{name}, {row['value']:.3g} ± {row['std']:.2g} {row['unit']}, may also be "
+                f"{effect_on(*named(effect))}: except near reversals and at rest the two are the "
+                "same, and these recordings do not distinguish them"
+            )
     return found
 
 

@@ -17,11 +17,11 @@ from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
 from .asked import Asked
-from .contacts import suspected
 from .diagnosis import Diagnosis, over_recordings, share_left
 from .explore import DECISIVE, Candidate, explore, key_of
 from .fits import Fits, released_names
 from .landscape import Landscape, form, forms_of
+from .last_tries import in_contact, replaced, without_offset
 from .likelihood import price, score_of
 from .models import LIKELY, Model, Named, Visited, listed
 from .predict import Predictor
@@ -40,8 +40,6 @@ from .watched import ROUND, Watched
 _VERIFIED, _INEXACT = 3, 0.08
 # Largest number of predicted sets among which those are searched.
 _EXAMINED = 12
-# Largest number of predicted models that are fitted because they may replace the chosen one.
-_RIVALS = 2
 # Largest number of effects in a predicted set. What sets of two explain is predicted to a few per
 # cent; larger sets are searched from the next fit.
 _AHEAD = 2
@@ -73,6 +71,7 @@ class Search:
         self.removed: tuple[Named, ...] = ()
         self.small: set[tuple] = set()
         self.failures: tuple[str, ...] = ()
+        self.offsets: dict[str, AbstractEffect] = {}
         self.latest: tuple[Screened, Diagnosis] | None = None
         self.diagnoses: dict[tuple, Diagnosis] = {}
 
@@ -96,10 +95,8 @@ class Search:
             if better is None and (better := self._without_one(at)) is not None:
                 gone = [n for n in at.names if n not in better.names]
                 self.removed = (*self.removed, *gone)
-            if better is None:
-                better = self._replaced(at)
-            if better is None:
-                better = self._in_contact(at)
+            for attempt in (replaced, in_contact, without_offset):
+                better = attempt(self, at) if better is None else better
             if better is None:
                 break
             at = better
@@ -125,7 +122,7 @@ class Search:
         screened, diagnosis = self._screened(first, ())
         if first.mistake:
             # Effects would only approximate the mistake.
-            return self._visit((), first)
+            return self.visit((), first)
         # If noise is strongly coloured, plain output error is imprecise. A filter that is estimated
         # from the residual itself would model a missing effect as noise, so that of the diagnosis
         # is used.
@@ -137,7 +134,7 @@ class Search:
             self.latest = screened, diagnosis
         else:
             self.latest = self._screened(fit, (), carried(screened, first, fit))
-        return self._visit((), fit)
+        return self.visit((), fit)
 
     def _screened(
         self, fit: Fit, effects: Sequence[AbstractEffect], known: Screened | None = None
@@ -210,7 +207,7 @@ class Search:
         found = self.fits.with_released(at.effects, release, noise)
         if not found.status.simulated:
             return None
-        model = self._judged(self._added(found), found)
+        model = self._judged(self.added(found), found)
         cost = release.freedom * value
         model = dataclasses.replace(model, score=model.score + cost)
         least = DECISIVE if release.again else max(effect - DECISIVE, 0.0)
@@ -293,9 +290,9 @@ class Search:
             return None
         if not fit.status.simulated:
             return None
-        added, loose = self._added(fit), undetermined(fit, len(asked.effects))
+        added, loose = self.added(fit), undetermined(fit, len(asked.effects))
         if not loose:
-            return self._visit(added, fit)
+            return self.visit(added, fit)
         kept = tuple(e for e in added if not any(e is x for x in loose))
         if len(kept) == len(at.effects):
             return None
@@ -342,56 +339,9 @@ class Search:
         assert at.fit is not None
         self.watched.begin("fit", f"fit with {listed(effects) or 'nothing'} alone")
         fit = self.fits.exchanged(at.fit.loop, at.effects, effects, at.noise)
-        return self._visit(self._added(fit), fit)
+        return self.visit(self.added(fit), fit)
 
-    def _replaced(self, at: Model) -> Model | None:
-        """The best fit of a model with another effect in the place of one, if it is better.
-
-        Predictions are inexact, so a predicted model that is not decisively worse may be better.
-        """
-        assert at.fit is not None
-        own, best = Counter(map(form, at.effects)), at
-        near = self.visited.ranked(
-            lambda m: m.fit is None and m.curve is None and m.score < at.score + DECISIVE
-        )
-        rivals = [
-            m
-            for m in near
-            if len(m.effects) == len(at.effects)
-            and (Counter(map(form, m.effects)) - own).total() == 1
-        ]
-        for rival in rivals[:_RIVALS]:
-            self.watched.begin("fit", f"fit with {listed(rival.effects)} instead", ROUND)
-            try:
-                fit = self.fits.exchanged(at.fit.loop, at.effects, rival.effects, rival.noise)
-            except (ModelError, FitError) as error:
-                self.failures = (*self.failures, f"no fit with {rival.label}: {error}")
-                continue
-            if fit.status.simulated:
-                best = min(best, self._visit(self._added(fit), fit), key=lambda m: m.score)
-        return None if best is at else best
-
-    def _in_contact(self, at: Model) -> Model | None:
-        """The best fit with a contact of which predictions explain too little, if it is better."""
-        assert at.fit is not None
-        full, best = len(at.effects) >= self.asked.most, at
-        if full or imposed(at.fit.loop) or at.key not in self.diagnoses:
-            return None
-        for contact in suspected(self.diagnoses[at.key]):
-            if self.visited.fitted((*at.effects, contact)) is not None:
-                continue
-            self.watched.begin("fit", f"fit with {listed([contact])}", ROUND)
-            try:
-                fit = self.fits.with_effects(at.fit, at.effects, (contact,), at.noise, 0.0)
-            except (ModelError, FitError) as error:
-                said = f"no fit with {listed([contact])}: {error}"
-                self.failures = (*self.failures, said)
-                continue
-            if fit.status.simulated:
-                best = min(best, self._visit(self._added(fit), fit), key=lambda m: m.score)
-        return best if best.score < at.score - LIKELY else None
-
-    def _visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
+    def visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
         """A fitted model, which is stored and drawn."""
         model = self._judged(effects, fit)
         self.visited.add(model)
@@ -404,7 +354,7 @@ class Search:
         left = over_recordings(fit.error_percent.to_numpy())
         return Model(effects, judged.value, fit=fit, noise=judged.noise, left=left)
 
-    def _added(self, fit: Fit) -> tuple[AbstractEffect, ...]:
+    def added(self, fit: Fit) -> tuple[AbstractEffect, ...]:
         """The effects of a fit that the starting model lacks; these are its last effects."""
         start = self.visited.fitted(())
         assert start is not None

@@ -241,7 +241,36 @@ def risen(before: Comparison, after: Comparison, noise: Sequence[ARFilter], wort
     - `noise`: noise filters of the residual of the later model, one per output.
     - `worth`: smallest relevant change, in % of a joint's torque.
     """
+    joints = _raised(before, after, noise, worth)
+    if not joints:
+        return ""
+    label = joint_columns(after.loop.joints)[joints[0]]
+    was, now = (over_recordings(c.error_percent.to_numpy())[joints[0]] for c in (before, after))
+    return (
+        f"the added effects raised the error of {label} on held-out recordings from "
+        f"{was:.3g} to {now:.3g} %: also fit recordings with motions like the held-out ones"
+    )
+
+
+def on_unseen(
+    before: Comparison, after: Comparison, noise: Sequence[ARFilter], worth: float
+) -> OnUnseen:
+    """What an added effect does to the errors of the joints on held-out recordings.
+
+    **Arguments:** as for `risen`.
+    """
+    raises = bool(_raised(before, after, noise, worth))
+    if _raised(after, before, noise, worth):
+        return "mixed" if raises else "lowers"
+    return "raises" if raises else "unchanged"
+
+
+def _raised(
+    before: Comparison, after: Comparison, noise: Sequence[ARFilter], worth: float
+) -> list[int]:
+    """Joints, from 0, of which the second of two models has the larger held-out error."""
     errors = [over_recordings(c.error_percent.to_numpy()) for c in (before, after)]
+    found = []
     for j, filt in enumerate(noise):
         pairs = [(b[:, j], a[:, j]) for b, a in zip(before.residuals, after.residuals, strict=True)]
         rise = sum(float(a @ a - b @ b) for b, a in pairs)
@@ -250,25 +279,8 @@ def risen(before: Comparison, after: Comparison, noise: Sequence[ARFilter], wort
         # Twice the standard deviation of the sum of noise times change, whose mean is zero.
         chance = 2 * np.sqrt(sum(_through(filt, d) for d in changed))
         if errors[1][j] - errors[0][j] > worth and rise + moved > _ROSE * chance:
-            label = joint_columns(after.loop.joints)[j]
-            return (
-                f"the added effects raised the error of {label} on held-out recordings from "
-                f"{errors[0][j]:.3g} to {errors[1][j]:.3g} %: also fit recordings with motions "
-                "like the held-out ones"
-            )
-    return ""
-
-
-def on_unseen(
-    before: Comparison, after: Comparison, noise: Sequence[ARFilter], worth: float
-) -> OnUnseen:
-    """Whether an added effect lowers or raises the error on held-out recordings.
-
-    **Arguments:** as for `risen`.
-    """
-    if risen(before, after, noise, worth):
-        return "raises"
-    return "lowers" if risen(after, before, noise, worth) else "unchanged"
+            found.append(j)
+    return found
 
 
 def _through(filt: ARFilter, x: Float[np.ndarray, " samples"]) -> float:

@@ -1,0 +1,100 @@
+"""Models that a search tries in full when no addition and no removal is better."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+from ..effects import AbstractEffect, AsymmetricFriction
+from ..errors import FitError, ModelError
+from ..estimate import Fit
+from ..simulation.dynamics import imposed
+from .contacts import suspected
+from .explore import DECISIVE, key_of
+from .landscape import form
+from .likelihood import price
+from .models import LIKELY, Model, listed
+from .offsets import instead_of_offsets
+from .watched import ROUND
+
+if TYPE_CHECKING:
+    from .search import Search
+
+# Largest number of predicted models that are fitted because they may replace the chosen one.
+_RIVALS = 2
+
+
+def replaced(search: "Search", at: Model) -> Model | None:
+    """The best fit of a model with another effect in the place of one, if it is better.
+
+    Predictions are inexact, so a predicted model that is not decisively worse may be better.
+    """
+    assert at.fit is not None
+    own, best = Counter(map(form, at.effects)), at
+    near = search.visited.ranked(
+        lambda m: m.fit is None and m.curve is None and m.score < at.score + DECISIVE
+    )
+    rivals = [
+        m
+        for m in near
+        if len(m.effects) == len(at.effects) and (Counter(map(form, m.effects)) - own).total() == 1
+    ]
+    loop = at.fit.loop
+    for rival in rivals[:_RIVALS]:
+        again = partial(search.fits.exchanged, loop, at.effects, rival.effects, rival.noise)
+        best = _better(search, best, rival.effects, again)
+    return None if best is at else best
+
+
+def in_contact(search: "Search", at: Model) -> Model | None:
+    """The best fit with a contact of which predictions explain too little, if it is better."""
+    assert at.fit is not None
+    full, best = len(at.effects) >= search.asked.most, at
+    if full or imposed(at.fit.loop) or at.key not in search.diagnoses:
+        return None
+    for contact in suspected(search.diagnoses[at.key]):
+        if search.visited.fitted((*at.effects, contact)) is None:
+            more = (contact,)
+            with_it = partial(search.fits.with_effects, at.fit, at.effects, more, at.noise, 0.0)
+            best = _better(search, best, more, with_it)
+    return best if best.score < at.score - LIKELY else None
+
+
+def without_offset(search: "Search", at: Model) -> Model | None:
+    """The best fit with friction by direction in place of an offset, if it is better."""
+    fit, predictor = search.seen
+    offered = AsymmetricFriction in search.asked.catalogue
+    if len(at.effects) >= search.asked.most or not offered or fit is not at.fit:
+        return None
+    size = len(at.effects) + 1
+    paid = price(size, search.forms) - price(size - 1, search.forms)
+    best = at
+    for found in instead_of_offsets(predictor, fit.std):
+        effects = (*at.effects, found.effect)
+        known = search.visited.fitted(effects) or search.small.intersection(key_of(effects))
+        if found.loss + paid < LIKELY and not known:
+            again = partial(search.fits.exchanged, found.loop, at.effects, effects, found.noise)
+            best = _better(search, best, (found.effect,), again)
+        if found.loss < DECISIVE:
+            search.offsets[found.name] = found.effect
+    return best if best.score < at.score - LIKELY else None
+
+
+def _better(
+    search: "Search", best: Model, effects: Sequence[AbstractEffect], fitted: Callable[[], Fit]
+) -> Model:
+    """The better one of a model and of a fit; a note tells if the fit fails.
+
+    **Arguments:**
+
+    - `effects`: the effects that the fit tries.
+    """
+    search.watched.begin("fit", f"fit with {listed(effects)} instead", ROUND)
+    try:
+        fit = fitted()
+    except (ModelError, FitError) as error:
+        search.failures = (*search.failures, f"no fit with {listed(effects)}: {error}")
+        return best
+    if not fit.status.simulated:
+        return best
+    return min(best, search.visit(search.added(fit), fit), key=lambda m: m.score)

@@ -1,0 +1,104 @@
+"""Offsets of a fitted model that may be friction that differs by direction."""
+
+import dataclasses
+from collections.abc import Iterator
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..effects import AbstractEffect, AsymmetricFriction, TorqueOffset
+from ..noise import ARFilter
+from ..parameters import Parameter
+from ..simulation.loop import ClosedLoop
+from .likelihood import score
+from .predict import Predictor
+from .signs import shapes_of_signs
+
+# Smallest offset for which this is examined, in standard deviations.
+_SIGNIFICANT = 4.0
+
+
+class Instead(eqx.Module):
+    """A model with friction that differs by direction in place of an offset, as predicted.
+
+    Both torques are constant except near reversals and at rest, so a fitted offset absorbs most of
+    such a friction, and what is left is too small to be found.
+
+    - `loop`: the loop without the offset.
+    - `name`: name of the offset.
+    - `effect`: the friction, with its predicted values.
+    - `rest`: the residual. `noise`: its noise filters.
+    - `loss`: increase of the score, without the price of the choice.
+    """
+
+    loop: ClosedLoop
+    name: str = eqx.field(static=True)
+    effect: AbstractEffect
+    rest: Float[np.ndarray, "recordings samples outputs"]
+    noise: tuple[ARFilter, ...]
+    loss: float
+
+
+def instead_of_offsets(predictor: Predictor, std: Float[np.ndarray, " values"]) -> list[Instead]:
+    """The models in which friction by direction replaces one of the significant offsets.
+
+    **Arguments:**
+
+    - `predictor`: the linear system of the fitted model.
+    - `std`: standard deviations of its values.
+    """
+    loop = predictor.system.loop
+    smoothing, form = shapes_of_signs(loop)
+    plain = predictor.predict([])
+    now = score(predictor.data, plain.rest, plain.freedom, 0, 0).value
+    found = []
+    for p, place, joint in _offsets(loop):
+        value = float(p.where(loop))
+        if not abs(value) > _SIGNIFICANT * std[place]:
+            continue
+        without = _without(predictor, p, place, value)
+        sign = {"smoothing": float(smoothing[joint - 1]), "form": float(form[joint - 1])}
+        there = without.predict([AsymmetricFriction(joint=joint, **sign)])
+        if there.possible:
+            then = score(without.data, there.rest, there.freedom, 0, 0)
+            own = without.system.loop, p.name, there.effects[0]
+            found.append(Instead(*own, there.rest, then.noise, then.value - now))
+    return sorted(found, key=lambda x: x.loss)
+
+
+def held_offsets(loop: ClosedLoop) -> list[str]:
+    """Names of the offsets of a loop that are not estimated."""
+    return [
+        p.name
+        for p in loop.parameters
+        if p.name not in loop.names
+        and p.place[0] == "effects"
+        and isinstance(loop.effects[int(p.place[1])], TorqueOffset)
+    ]
+
+
+def _offsets(loop: ClosedLoop) -> Iterator[tuple[Parameter, int, int]]:
+    """Free offsets with place in `theta` and joint, on joints without friction by direction."""
+    had = {e.joint for e in loop.effects if isinstance(e, AsymmetricFriction)}
+    place = 0
+    for p in loop.free_parameters:
+        effect = loop.effects[int(p.place[1])] if p.place[0] == "effects" else None
+        if isinstance(effect, TorqueOffset) and effect.joint not in had:
+            yield p, place, effect.joint
+        place += p.size
+
+
+def _without(predictor: Predictor, p: Parameter, place: int, value: float) -> Predictor:
+    """The predictor of the loop with an offset held at zero.
+
+    Torque is linear in the offset, so the residual changes by its column.
+    """
+    system = predictor.system
+    changed = dataclasses.replace(
+        system,
+        loop=system.loop.hold(**{p.name: 0.0}),
+        residual=system.residual + value * system.base[..., place],
+        base=np.delete(system.base, place, axis=-1),
+    )
+    return Predictor.of(changed, predictor.noise, predictor.data.level)

@@ -1,0 +1,85 @@
+"""Offsets of a model that may be friction that differs by direction.
+
+Torque is that of inverse dynamics written out here, along motions in closed form.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from test_release import axis, predictor, recorded
+
+import jaxid
+from jaxid.discovery.fits import Fits
+from jaxid.discovery.models import LIKELY
+from jaxid.discovery.offsets import held_offsets, instead_of_offsets
+from jaxid.discovery.verify import Refits
+from jaxid.storage.campaign import Campaign
+
+SIZE, EPS = 0.8, 0.003
+
+
+def sharp(v):
+    return 2 / np.pi * np.arctan(v / EPS)
+
+
+def biased(seed: int, smooth: bool) -> jaxid.Recording:
+    """An axis with a constant torque, or with friction that is larger forward than backward."""
+    record = recorded(seed, sharp, noise=0.1)
+    v = np.gradient(record.q[:, 0], record.time)
+    more = SIZE * (sharp(v) ** 2 if smooth else np.ones_like(v))
+    return dataclasses.replace(record, tau=record.tau + more[:, None])
+
+
+def values(found) -> np.ndarray:
+    return np.full(len(found.system.loop.theta), 1e-3)
+
+
+def test_friction_by_direction_replaces_an_offset_that_absorbed_it():
+    seen = predictor([biased(1, True), biased(2, True)], axis(EPS))
+    (found,) = instead_of_offsets(seen, values(seen))
+    assert found.loss < -LIKELY
+    assert float(found.effect.coulomb) == pytest.approx(SIZE, rel=0.02)
+    assert held_offsets(found.loop) == ["offset1"]
+    assert float(found.loop.effects[2].level) == 0.0
+    # An offset that is not significant is not examined, nor one that the user holds.
+    assert instead_of_offsets(seen, 1e3 * values(seen)) == []
+    held = predictor([biased(1, True)], axis(EPS).hold("offset1"))
+    assert instead_of_offsets(held, values(held)) == []
+
+
+def test_an_offset_stays_where_the_torque_is_constant():
+    seen = predictor([biased(1, False), biased(2, False)], axis(EPS))
+    (found,) = instead_of_offsets(seen, values(seen))
+    assert found.loss > LIKELY
+
+
+def test_a_fit_without_an_offset_is_saved_under_its_own_name(monkeypatch):
+    runs = jaxid.Recordings.of([recorded(1, sharp)])
+    fit = jaxid.fit(axis(EPS), runs, jaxid.OEM(progress=False))
+    campaign, names = Campaign(None, {}), []
+    monkeypatch.setattr(campaign, "piece", lambda name, work: names.append(name) or fit)
+    fits = Fits(Refits(runs, jaxid.OEM()), campaign)
+    for loop in (axis(EPS), axis(EPS).hold(offset1=0.0)):
+        fits.exchanged(loop, (), (), ())
+    assert names[1] == f"{names[0]}, offset1 held"
+
+
+def searched(smooth: bool, **settings) -> jaxid.Discovery:
+    runs = [biased(k, smooth) for k in (1, 2)]
+    unseen = biased(3, smooth)
+    return jaxid.discover(axis(EPS), runs, validate=unseen, progress=False, **settings)
+
+
+@pytest.mark.slow
+def test_friction_by_direction_is_named_and_an_offset_is_not():
+    # What the friction explains beside the offset is smaller than `worth`.
+    found = searched(True, worth=5.0)
+    assert found.verdict == "explained"
+    (added,) = found.to_dict()["added"]
+    assert (added["effect"], added["joint"]) == ("asymmetric_friction", 1)
+    assert added["parameters"]["coulomb"]["value"] == pytest.approx(SIZE, rel=0.05)
+    assert any("offset1 was left out" in note for note in found.notes)
+    constant = searched(False)
+    assert constant.verdict == "adequate"
+    assert not any("offset" in note for note in constant.notes)
