@@ -15,6 +15,7 @@ from .landscape import form
 from .likelihood import price
 from .models import LIKELY, Model, listed
 from .offsets import instead_of_offsets
+from .signs import reshaped
 from .watched import ROUND
 
 if TYPE_CHECKING:
@@ -22,24 +23,31 @@ if TYPE_CHECKING:
 
 # Largest number of predicted models that are fitted because they may replace the chosen one.
 _RIVALS = 2
+# Relative error of predicted decreases of the score if a shape of a sign is estimated.
+_INEXACT = 0.2
 
 
 def replaced(search: "Search", at: Model) -> Model | None:
     """The best fit of a model with another effect in the place of one, if it is better.
 
-    Predictions are inexact, so a predicted model that is not decisively worse may be better.
+    Predictions are inexact, so a predicted model that is not decisively worse may be better. If a
+    shape of the joint's sign is estimated, they are less exact.
     """
     assert at.fit is not None
-    own, best = Counter(map(form, at.effects)), at
-    near = search.visited.ranked(
-        lambda m: m.fit is None and m.curve is None and m.score < at.score + DECISIVE
-    )
-    rivals = [
-        m
-        for m in near
-        if len(m.effects) == len(at.effects) and (Counter(map(form, m.effects)) - own).total() == 1
-    ]
-    loop = at.fit.loop
+    loop, own, best = at.fit.loop, Counter(map(form, at.effects)), at
+    start = search.visited.fitted(())
+    assert start is not None
+    reach = max(DECISIVE, _INEXACT * (start.score - at.score))
+
+    def is_rival(m: Model) -> bool:
+        others = [e for e in m.effects if form(e) not in own]
+        if m.fit is not None or m.curve is not None or len(m.effects) != len(at.effects):
+            return False
+        one = (Counter(map(form, m.effects)) - own).total() == 1
+        allowed = reach if any(reshaped(loop, e) for e in others) else DECISIVE
+        return one and m.score < at.score + allowed
+
+    rivals = search.visited.ranked(is_rival)
     for rival in rivals[:_RIVALS]:
         again = partial(search.fits.exchanged, loop, at.effects, rival.effects, rival.noise)
         best = _better(search, best, rival.effects, again)

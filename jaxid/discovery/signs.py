@@ -45,6 +45,16 @@ def of_one_sign(loop: ClosedLoop) -> ClosedLoop:
     return loop.with_values(**{name: estimated[own] for name, own in held if own in estimated})
 
 
+def reshaped(loop: ClosedLoop, effect: AbstractEffect) -> bool:
+    """Whether the shape of a sign is estimated on the joint of an effect.
+
+    A change of the shape can replace a friction, which a linear system predicts with large errors.
+    """
+    free = [p for p in loop.free_parameters if p.place[0] == "effects" and p.place[2:] in OF_SIGN]
+    joints = {_joint_of_sign(loop.effects[int(p.place[1])]) for p in free}
+    return _joint_of_sign(effect) in joints
+
+
 def follows(p: Parameter, loop: ClosedLoop) -> bool:
     """Whether a parameter is a shape of a sign that follows the joint's Coulomb friction."""
     if p.place[0] != "effects" or p.place[2:] not in OF_SIGN:

@@ -14,13 +14,14 @@ from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
 from .hypotheses import free_of
 from .likelihood import score_of
-from .signs import of_one_sign
+from .signs import of_one_sign, reshaped
 
 # Factor on the gap at the start of another refit. In a wide gap the link moves freely for longer,
 # so that all parameters of the contact influence the motion.
 _WIDE = 10.0
-# Ratio of what an effect explains to its price above which no refit without it is made.
-_CERTAIN = 3.0
+# Ratio of what an effect explains to its price above which no refit without it is made; the same if
+# the sign of its friction may change, which can replace it.
+_CERTAIN, _RESHAPED = 3.0, 10.0
 # Ratio of actual to predicted decrease of the score above which, or below whose inverse, the refit
 # is repeated from another start.
 _FAR = 2.0
@@ -165,7 +166,7 @@ def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
     # The increase of the squared error without the effect (Wald), and the decrease of the price.
     lost = float(values @ np.linalg.pinv(covariance) @ values)
     saved = len(values_of) * np.log(sum(r.size for r in fit.residuals)) + price
-    return bool(lost > _CERTAIN * saved)
+    return bool(lost > (_RESHAPED if reshaped(fit.loop, effect) else _CERTAIN) * saved)
 
 
 def undetermined(found: Fit, added: int) -> tuple[AbstractEffect, ...]:
