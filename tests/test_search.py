@@ -24,6 +24,7 @@ from jaxid.discovery.models import Model, Visited, probability
 from jaxid.discovery.score import Data
 from jaxid.discovery.search import Search
 from jaxid.discovery.signs import of_one_sign
+from jaxid.discovery.transmissions import similar_ones
 from jaxid.discovery.verify import undetermined
 from jaxid.effects import (
     AbstractEffect,
@@ -227,6 +228,19 @@ def test_a_close_rival_that_was_only_predicted_is_fitted(offset_case, offset_sto
     assert found.score < at.score - 5
     # It was fitted, so it is not tried again.
     assert replaced(search, found) is None
+
+
+def test_a_fitted_elasticity_may_be_a_gap(offset_case):
+    asked = search_of(offset_case).asked
+    soft = JointElasticity(joint=2, compliance=1e-3, rotor=0.1)
+    ((effect, gap),) = similar_ones((TorqueOffset(joint=1), soft), asked)
+    assert effect is soft
+    assert isinstance(gap, Backlash)
+    assert (gap.joint, float(gap.rotor)) == (2, 0.1)
+    assert float(gap.stiffness) == pytest.approx(1e3)
+    load = np.sqrt(np.mean(np.concatenate([r.tau[:, 1] for r in asked.recordings]) ** 2))
+    assert float(gap.gap) == pytest.approx(2e-3 * load)
+    assert list(similar_ones((gap,), asked)) == []
 
 
 @pytest.mark.xdist_group("offset")

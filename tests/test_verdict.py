@@ -16,6 +16,7 @@ from jaxid.discovery.verdict import _power, _spread, _through, on_unseen, refute
 from jaxid.discovery.verify import Refits
 from jaxid.effects import Spring, TimeDelay, TorqueOffset, TorqueRipple
 from jaxid.noise import ARFilter
+from jaxid.report._head import values
 
 pytestmark = pytest.mark.xdist_group("offset")
 WORTH = 0.05
@@ -80,6 +81,22 @@ def test_what_held_out_recordings_say_of_an_effect_is_told(found):
     assert "(refuted: raises the error on held-out recordings)" in story.sentence
     assert "probability" not in story.sentence
     assert story.to_dict()["added"][0]["held_out"] == "raises"
+
+
+def test_no_probability_is_given_if_no_examined_model_passes_the_tests(found):
+    step = dataclasses.replace(found.steps[-1], probability=None)
+    story = dataclasses.replace(
+        found, verdict="undetermined", reason="a test fails", steps=(found.steps[0], step)
+    )
+    assert "the best model adds torque offset on joint 2, but a test fails." in story.sentence
+    text = " ".join(repr(story).split())
+    assert "torque_offset on joint 2 (confirmed by held-out recordings): level" in text
+    assert "no probabilities are given" in text
+    assert "no probabilities are given" not in repr(found)
+    assert story.to_dict()["added"][0]["probability"] is None
+    page = str(values(story))
+    assert "(confirmed by held-out recordings): " in page
+    assert "probability" not in page
 
 
 def test_an_effect_that_lowers_one_error_and_raises_another_is_neither(found, offset_case):

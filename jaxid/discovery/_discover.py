@@ -135,7 +135,13 @@ def _told(
     models = _held_out(search, models, steps)
     reason = _STOPPED if interrupted else _raised(search, steps)
     if not unfinished and not reason:
-        reason = _doubt(search, verdict, steps, models)
+        reason = _doubt(search, verdict, steps)
+    if (reason and not interrupted) or verdict == "outside_catalogue":
+        # Probabilities assume that one of the examined models is right.
+        steps = [s if s.added is None else dataclasses.replace(s, probability=None) for s in steps]
+    elif not unfinished and not reason:
+        alike = {named(s.added): s.alike for s in steps if s.added is not None}
+        reason = undecided(models, search.at, alike)
     notes = (*remarks(steps, search.given, search.offsets), *search.failures)
     if unfinished:
         notes = (f"stopped at the limit of {search.asked.most} effects: raise most", *notes)
@@ -152,8 +158,8 @@ def _told(
     )
 
 
-def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step], models: Sequence[Model]) -> str:
-    """Why the verdict is undetermined; empty if it is not."""
+def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step]) -> str:
+    """The reason if the final model fails a test; empty if it passes all of them."""
     first, last = steps[0], steps[-1]
     if first.fit.mistake:
         return f"{first.fit.mistake}; no effect was searched, so correct this first"
@@ -169,9 +175,7 @@ def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step], models: Sequ
         both = first.held_out, last.held_out
     assert last.diagnosis is not None
     worth = search.asked.worth
-    refutation = refuted(last.fit, search.at.noise, last.diagnosis, both, worth)
-    alike = {named(s.added): s.alike for s in steps if s.added is not None}
-    return refutation or undecided(models, search.at, alike)
+    return refuted(last.fit, search.at.noise, last.diagnosis, both, worth)
 
 
 def _tested(search: Search, steps: Sequence[Step]) -> list[Step]:

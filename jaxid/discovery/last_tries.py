@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING
 from ..effects import AbstractEffect, AsymmetricFriction
 from ..errors import FitError, ModelError
 from ..estimate import Fit
+from ..noise import ARFilter
 from ..simulation.dynamics import imposed
-from .contacts import suspected
 from .explore import DECISIVE, key_of
 from .landscape import form
 from .likelihood import price
 from .models import LIKELY, Model, listed
 from .offsets import instead_of_offsets
 from .signs import reshaped
+from .transmissions import similar_ones, suspected
 from .watched import ROUND
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def replaced(search: "Search", at: Model) -> Model | None:
             return False
         one = (Counter(map(form, m.effects)) - own).total() == 1
         allowed = reach if any(reshaped(loop, e) for e in others) else DECISIVE
-        return one and m.score < at.score + allowed
+        return one and bool(m.score < at.score + allowed)
 
     rivals = search.visited.ranked(is_rival)
     for rival in rivals[:_RIVALS]:
@@ -54,17 +55,23 @@ def replaced(search: "Search", at: Model) -> Model | None:
     return None if best is at else best
 
 
-def in_contact(search: "Search", at: Model) -> Model | None:
-    """The best fit with a contact of which predictions explain too little, if it is better."""
+def with_transmission(search: "Search", at: Model) -> Model | None:
+    """The best fit with a transmission of which predictions explain too little, if it is better."""
     assert at.fit is not None
     full, best = len(at.effects) >= search.asked.most, at
     if full or imposed(at.fit.loop) or at.key not in search.diagnoses:
         return None
-    for contact in suspected(search.diagnoses[at.key]):
-        if search.visited.fitted((*at.effects, contact)) is None:
-            more = (contact,)
-            with_it = partial(search.fits.with_effects, at.fit, at.effects, more, at.noise, 0.0)
-            best = _better(search, best, more, with_it)
+    diagnosis = search.diagnoses[at.key]
+    for effect in suspected(diagnosis):
+        if search.visited.fitted((*at.effects, effect)) is None:
+            best = _better(search, best, (effect,), _added(search, at, effect, at.noise))
+    if diagnosis.depends_on():
+        # One transmission may only resemble another.
+        for effect, similar in similar_ones(at.effects, search.asked):
+            rest = tuple(e for e in at.effects if e is not effect)
+            if search.visited.fitted((*rest, similar)) is None:
+                less = search.had(at, rest) or search.refitted(at, rest)
+                best = _better(search, best, (similar,), _added(search, less, similar, at.noise))
     return best if best.score < at.score - LIKELY else None
 
 
@@ -86,6 +93,14 @@ def without_offset(search: "Search", at: Model) -> Model | None:
         if found.loss < DECISIVE:
             search.offsets[found.name] = found.effect
     return best if best.score < at.score - LIKELY else None
+
+
+def _added(
+    search: "Search", at: Model, effect: AbstractEffect, noise: Sequence[ARFilter]
+) -> Callable[[], Fit]:
+    """The function that fits a model with an additional effect of which predictions are wrong."""
+    assert at.fit is not None
+    return partial(search.fits.with_effects, at.fit, at.effects, (effect,), noise, 0.0)
 
 
 def _better(

@@ -21,7 +21,7 @@ from .diagnosis import Diagnosis, over_recordings, share_left
 from .explore import DECISIVE, Candidate, explore, key_of
 from .fits import Fits, released_names
 from .landscape import Landscape, form, forms_of
-from .last_tries import in_contact, replaced, without_offset
+from .last_tries import replaced, with_transmission, without_offset
 from .likelihood import price, score_of
 from .models import LIKELY, Model, Named, Visited, listed
 from .predict import Predictor
@@ -95,7 +95,7 @@ class Search:
             if better is None and (better := self._without_one(at)) is not None:
                 gone = [n for n in at.names if n not in better.names]
                 self.removed = (*self.removed, *gone)
-            for attempt in (replaced, in_contact, without_offset):
+            for attempt in (replaced, with_transmission, without_offset):
                 better = attempt(self, at) if better is None else better
             if better is None:
                 break
@@ -321,7 +321,12 @@ class Search:
             if needed(at.fit, gone, price(len(at.effects), self.forms)):
                 continue
             less = tuple(e for e in at.effects if e is not gone)
-            found.append(self.had(at, less) or self.refitted(at, less))
+            had = self.had(at, less)
+            if had is None or had.score > at.score + LIKELY:
+                # An earlier fit may be at another minimum.
+                again = self.refitted(at, less)
+                had = min(again, had or again, key=lambda m: m.score)
+            found.append(had)
         best = min(found, key=lambda m: m.score, default=at)
         if best is not at and best.score < at.score + LIKELY:
             return best

@@ -15,6 +15,7 @@ from ..simulation.loop import ClosedLoop
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
 from .hypotheses import effect_on, on_recordings
+from .text import in_brackets
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,8 +31,9 @@ class Step(eqx.Module):
 
     `diagnosis` exists if the search continued from this model, and for the first and last step.
     `added` is the effect that this step adds to the previous one; `probability` is the weight of
-    all models with it; `alike` are effects that these recordings cannot distinguish from it;
-    `unseen` tells what it does to the error on held-out recordings, None without such recordings.
+    all models with it, None if none of them passes the tests of the verdict; `alike` are effects
+    that these recordings cannot distinguish from it; `unseen` tells what it does to the error on
+    held-out recordings, None without such recordings.
     """
 
     label: str
@@ -40,11 +42,11 @@ class Step(eqx.Module):
     diagnosis: Diagnosis | None
     added: AbstractEffect | None = None
     alike: tuple[tuple[str, int | None], ...] = ()
-    probability: float = 1.0
+    probability: float | None = 1.0
     unseen: OnUnseen | None = eqx.field(static=True, default=None)
 
     def belief(self, tested: bool = True) -> str:
-        """How far the effect can be believed, in words.
+        """How far the effect can be believed, in words; empty if nothing is known.
 
         The probability depends on the fitted recordings only, and on the assumption that one of
         the examined models is right. It is not given for an effect that held-out recordings refute.
@@ -55,12 +57,14 @@ class Step(eqx.Module):
         """
         if self.unseen == "raises":
             return "refuted: raises the error on held-out recordings"
+        said = [] if self.probability is None else [f"probability {odds(self.probability)}"]
         held_out = {
-            "lowers": ", confirmed by held-out recordings",
-            "mixed": ", lowers the error of some joints on held-out recordings and raises others",
+            "lowers": "confirmed by held-out recordings",
+            "mixed": "lowers the error of some joints on held-out recordings and raises others",
         }
-        said = held_out.get(self.unseen or "", "") if tested else ""
-        return f"probability {odds(self.probability)}{said}"
+        if tested and self.unseen in held_out:
+            said.append(held_out[self.unseen])
+        return ", ".join(said)
 
 
 def odds(share: float) -> str:
@@ -77,7 +81,7 @@ def added_in_words(steps: Sequence[Step], sure: bool = True) -> list[str]:
     beliefs = {_placed(e.spoken(), e): said for e, said in added}
     often = {1: "", 2: " twice"}
     return [
-        f"{name}{often.get(n, f' {n} times')}{f' ({beliefs[name]})' * sure}"
+        f"{name}{often.get(n, f' {n} times')}{in_brackets(beliefs[name]) * sure}"
         for name, n in counted.items()
     ]
 

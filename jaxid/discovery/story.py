@@ -29,7 +29,7 @@ from .hypotheses import effect_on
 from .landscape import form
 from .models import Model, models_table, named, picked
 from .step import Step, added_in_words, errors_of, found_parameters, joint_errors, odds, step_name
-from .text import WIDTH, capitalised, errors_table, joined, models_lines, wrapped
+from .text import WIDTH, capitalised, errors_table, in_brackets, joined, models_lines, wrapped
 from .verdict import Outcome
 from .verify import Refits
 
@@ -378,10 +378,12 @@ class Discovery(AbstractShown):
                 + f" {p['unit']}"
                 for n, p in values.items()
             )
-            lines.append(f"{step_name(step)} ({step.belief()}): {shown}")
+            lines.append(f"{step_name(step)}{in_brackets(step.belief())}: {shown}")
             if step.alike:
                 others = ", ".join(effect_on(n, j) for n, j in step.alike)
                 lines.append(f"these recordings cannot distinguish {step_name(step)} from {others}")
+        if any(step.probability is None for step in self.steps):
+            lines.append("no probabilities are given, because no examined model passes the tests")
         return lines
 
     def _repr_html_(self) -> str:

@@ -18,6 +18,11 @@ def joined(words: Sequence[str]) -> str:
     return " and ".join(x for x in (", ".join(words[:-1]), *words[-1:]) if x)
 
 
+def in_brackets(words: str) -> str:
+    """The words in brackets after a space; empty if there are none."""
+    return f" ({words})" if words else ""
+
+
 def capitalised(words: str) -> str:
     """The words with a capital first letter; the others are unchanged."""
     return f"{words[:1].upper()}{words[1:]}"

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from ..discovery import Discovery
 from ..discovery.hypotheses import effect_on
 from ..discovery.step import Step
-from ..discovery.text import capitalised
+from ..discovery.text import capitalised, in_brackets
 from ._html import Markup, anchor, join, link, section, tag, with_deviation
 
 # Characters above which the headline is smaller.
@@ -98,7 +98,7 @@ def values(story: Discovery) -> Markup | None:
         title = tag("b", capitalised(name))
         # A number stays with its sign.
         sure = step.belief().replace("> ", ">\u00a0").replace("< ", "<\u00a0")
-        lines.append(tag("li", join(title, f" ({sure}): {shown}")))
+        lines.append(tag("li", join(title, f"{in_brackets(sure)}: {shown}")))
     return tag("ul", *lines, class_="found") if lines else None
 
 
