@@ -80,6 +80,7 @@ class Fits:
         had: Sequence[AbstractEffect],
         effects: Sequence[AbstractEffect],
         noise: Sequence[ARFilter],
+        near: bool = False,
     ) -> Fit:
         """The fit of a model with other effects, from their current values.
 
@@ -89,13 +90,14 @@ class Fits:
         **Arguments:**
 
         - `had`: effects of the loop over the starting model. `effects`: those in their place.
+        - `near`: whether the new effects are near their optimum, so that one fit suffices.
         """
         kept = [e for e in loop.effects if not any(e is x for x in had)]
         start, refits = loop.with_effects((*kept, *effects)), self._refits
         new = not all(any(e is x for x in had) for e in effects)
 
         def better() -> Fit:
-            plain = [refits.unfiltered(start, noise).loop] if new else []
+            plain = [refits.unfiltered(start, noise).loop] if new and not near else []
             return refits.best([refits.filtered(x, noise) for x in (start, *plain)])
 
         name = f"{piece_name(effects)}, {'instead' if new else 'alone'}"

@@ -22,7 +22,8 @@ from .watched import ROUND
 if TYPE_CHECKING:
     from .search import Search
 
-# Largest number of predicted models that are fitted because they may replace the chosen one.
+# Largest number of predicted models of a kind that are fitted because they may replace the chosen
+# one.
 _RIVALS = 2
 # Relative error of predicted decreases of the score if a shape of a sign is estimated.
 _INEXACT = 0.2
@@ -84,11 +85,12 @@ def without_offset(search: "Search", at: Model) -> Model | None:
     size = len(at.effects) + 1
     paid = price(size, search.forms) - price(size - 1, search.forms)
     best = at
-    for found in instead_of_offsets(predictor, fit.std):
+    for found in instead_of_offsets(predictor, fit.std)[:_RIVALS]:
         effects = (*at.effects, found.effect)
         known = search.visited.fitted(effects) or search.small.intersection(key_of(effects))
         if found.loss + paid < LIKELY and not known:
-            again = partial(search.fits.exchanged, found.loop, at.effects, effects, found.noise)
+            asked = found.loop, at.effects, effects, found.noise
+            again = partial(search.fits.exchanged, *asked, near=True)
             best = _better(search, best, (found.effect,), again)
         if found.loss < DECISIVE:
             search.offsets[found.name] = found.effect
