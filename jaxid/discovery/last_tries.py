@@ -3,13 +3,13 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 from ..effects import AbstractEffect, AsymmetricFriction
 from ..errors import FitError, ModelError
 from ..estimate import Fit
 from ..noise import ARFilter
 from ..simulation.dynamics import imposed
+from .examined import Examined
 from .explore import DECISIVE, key_of
 from .landscape import form
 from .likelihood import price
@@ -19,9 +19,6 @@ from .signs import reshaped
 from .transmissions import similar_ones, suspected
 from .watched import ROUND
 
-if TYPE_CHECKING:
-    from .search import Search
-
 # Largest number of predicted models of a kind that are fitted because they may replace the chosen
 # one.
 _RIVALS = 2
@@ -29,7 +26,7 @@ _RIVALS = 2
 _INEXACT = 0.2
 
 
-def replaced(search: "Search", at: Model) -> Model | None:
+def replaced(search: Examined, at: Model) -> Model | None:
     """The best fit of a model with another effect in the place of one, if it is better.
 
     Predictions are inexact, so a predicted model that is not decisively worse may be better. If a
@@ -56,7 +53,7 @@ def replaced(search: "Search", at: Model) -> Model | None:
     return None if best is at else best
 
 
-def with_transmission(search: "Search", at: Model) -> Model | None:
+def with_transmission(search: Examined, at: Model) -> Model | None:
     """The best fit with a transmission of which predictions explain too little, if it is better."""
     assert at.fit is not None
     full, best = len(at.effects) >= search.asked.most, at
@@ -76,7 +73,7 @@ def with_transmission(search: "Search", at: Model) -> Model | None:
     return best if best.score < at.score - LIKELY else None
 
 
-def without_offset(search: "Search", at: Model) -> Model | None:
+def without_offset(search: Examined, at: Model) -> Model | None:
     """The best fit with friction by direction in place of an offset, if it is better."""
     fit, predictor = search.seen
     offered = AsymmetricFriction in search.asked.catalogue
@@ -98,7 +95,7 @@ def without_offset(search: "Search", at: Model) -> Model | None:
 
 
 def _added(
-    search: "Search", at: Model, effect: AbstractEffect, noise: Sequence[ARFilter]
+    search: Examined, at: Model, effect: AbstractEffect, noise: Sequence[ARFilter]
 ) -> Callable[[], Fit]:
     """The function that fits a model with an additional effect of which predictions are wrong."""
     assert at.fit is not None
@@ -106,7 +103,7 @@ def _added(
 
 
 def _better(
-    search: "Search", best: Model, effects: Sequence[AbstractEffect], fitted: Callable[[], Fit]
+    search: Examined, best: Model, effects: Sequence[AbstractEffect], fitted: Callable[[], Fit]
 ) -> Model:
     """The better one of a model and of a fit; a note tells if the fit fails.
 

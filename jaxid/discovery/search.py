@@ -2,11 +2,9 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import islice
-from typing import Any
 
-import equinox as eqx
 import numpy as np
 
 from ..effects import AbstractEffect
@@ -15,15 +13,13 @@ from ..estimate import Fit
 from ..noise import ARFilter
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
-from ..storage.campaign import Campaign
-from .asked import Asked
 from .diagnosis import Diagnosis, over_recordings, share_left
+from .examined import Examined
 from .explore import DECISIVE, Candidate, explore, key_of
-from .fits import Fits, released_names
 from .landscape import Landscape, form, forms_of
 from .last_tries import replaced, with_transmission, without_offset
-from .likelihood import price, score_of
-from .models import LIKELY, Model, Named, Visited, listed
+from .likelihood import price
+from .models import LIKELY, Model, Named, listed
 from .predict import Predictor
 from .ranking import Screened, judge
 from .release import released
@@ -32,8 +28,8 @@ from .screening import carried, screen
 from .support import unsupported
 from .system import System
 from .verdict import Outcome
-from .verify import Refits, needed, undetermined
-from .watched import ROUND, Watched
+from .verify import needed, undetermined
+from .watched import ROUND
 
 # Largest number of sets that are refitted in one round, and the relative error of predicted
 # decreases of the score.
@@ -45,35 +41,16 @@ _EXAMINED = 12
 _AHEAD = 2
 
 
-class Search:
+class Search(Examined):
     """A search, with the examined models and the current one.
 
-    **Arguments:**
-
-    - `asked`: the arguments of the discovery.
-    - `campaign`: saved steps.
-    - `say`: function that reports an activity. `draw`: function that draws a figure.
-    - `prefix`: of the names of saved steps.
+    **Arguments:** those of `Examined`.
     """
 
-    def __init__(
-        self,
-        asked: Asked,
-        campaign: Campaign,
-        say: Callable[..., None],
-        draw: Callable[[Callable[[], Any]], None] = lambda make: None,
-        prefix: str = "",
-    ) -> None:
-        self.asked, self.watched = asked, Watched(say, draw)
-        self.fits = Fits(Refits(asked.recordings, asked.method), campaign, prefix)
-        self.visited = Visited()
-        self.forms = 0
-        self.removed: tuple[Named, ...] = ()
-        self.small: set[tuple] = set()
-        self.failures: tuple[str, ...] = ()
-        self.offsets: dict[str, AbstractEffect] = {}
-        self.latest: tuple[Screened, Diagnosis] | None = None
-        self.diagnoses: dict[tuple, Diagnosis] = {}
+    # Effects that were added and later removed.
+    removed: tuple[Named, ...] = ()
+    # Linear system and diagnosis of the current fit, until a prediction has used them.
+    latest: tuple[Screened, Diagnosis] | None = None
 
     def run(self, loop: ClosedLoop) -> tuple[Outcome, bool]:
         """Predicts and verifies in rounds, until no model has a lower score.
@@ -207,7 +184,7 @@ class Search:
         found = self.fits.with_released(at.effects, release, noise)
         if not found.status.simulated:
             return None
-        model = self._judged(self.added(found), found)
+        model = self.judged(self.added(found), found)
         cost = release.freedom * value
         model = dataclasses.replace(model, score=model.score + cost)
         least = DECISIVE if release.again else max(effect - DECISIVE, 0.0)
@@ -296,16 +273,7 @@ class Search:
         kept = tuple(e for e in added if not any(e is x for x in loose))
         if len(kept) == len(at.effects):
             return None
-        return self.had(at, kept) or self.refitted(self._judged(added, fit), kept)
-
-    def had(self, at: Model, effects: Sequence[AbstractEffect]) -> Model | None:
-        """An earlier refit of a set with the same held values released; None if there is none."""
-        had = self.visited.fitted(effects)
-        if had is None or had.fit is None or at.fit is None:
-            return None
-        one, other = had.fit.loop, at.fit.loop
-        alike = bool(eqx.tree_equal(one.controller, other.controller))
-        return had if alike and released_names(one) == released_names(other) else None
+        return self.had(at, kept) or self.refitted(self.judged(added, fit), kept)
 
     def _without_one(self, at: Model) -> Model | None:
         """The model without one of its effects; None if all are needed.
@@ -338,33 +306,6 @@ class Search:
             self.small |= (Counter(at.key) - Counter(best.key)).keys()
             self.visited.forget(set(at.key) - set(best.key))
         return best
-
-    def refitted(self, at: Model, effects: Sequence[AbstractEffect]) -> Model:
-        """A fitted model with only some of its effects, fitted again from their current values."""
-        assert at.fit is not None
-        self.watched.begin("fit", f"fit with {listed(effects) or 'nothing'} alone")
-        fit = self.fits.exchanged(at.fit.loop, at.effects, effects, at.noise)
-        return self.visit(self.added(fit), fit)
-
-    def visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
-        """A fitted model, which is stored and drawn."""
-        model = self._judged(effects, fit)
-        self.visited.add(model)
-        self.watched.fitted(model)
-        return model
-
-    def _judged(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
-        """A fitted model with its score."""
-        judged = score_of(fit, len(effects), self.forms)
-        left = over_recordings(fit.error_percent.to_numpy())
-        return Model(effects, judged.value, fit=fit, noise=judged.noise, left=left)
-
-    def added(self, fit: Fit) -> tuple[AbstractEffect, ...]:
-        """The effects of a fit that the starting model lacks; these are its last effects."""
-        start = self.visited.fitted(())
-        assert start is not None
-        assert start.fit is not None
-        return fit.loop.effects[len(start.fit.loop.effects) :]
 
     def _left_by(self, c: Candidate) -> np.ndarray:
         """Relative error by joint of a set that was predicted in the last round, %."""

@@ -1,0 +1,86 @@
+"""The models that a search has examined, and full fits of further ones."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+
+from ..effects import AbstractEffect
+from ..estimate import Fit
+from ..storage.campaign import Campaign
+from .asked import Asked
+from .diagnosis import Diagnosis, over_recordings
+from .fits import Fits, released_names
+from .likelihood import score_of
+from .models import Model, Visited, listed
+from .predict import Predictor
+from .verify import Refits
+from .watched import Watched
+
+
+class Examined:
+    """The models that a search has examined, with what is known of them.
+
+    **Arguments:**
+
+    - `asked`: the arguments of the discovery.
+    - `campaign`: saved steps.
+    - `say`: function that reports an activity. `draw`: function that draws a figure.
+    - `prefix`: of the names of saved steps.
+    """
+
+    # Fit and linear system of the last prediction.
+    seen: tuple[Fit, Predictor]
+
+    def __init__(
+        self,
+        asked: Asked,
+        campaign: Campaign,
+        say: Callable[..., None],
+        draw: Callable[[Callable[[], Any]], None] = lambda make: None,
+        prefix: str = "",
+    ) -> None:
+        self.asked, self.watched = asked, Watched(say, draw)
+        self.fits = Fits(Refits(asked.recordings, asked.method), campaign, prefix)
+        self.visited = Visited()
+        self.forms = 0
+        self.small: set[tuple] = set()
+        self.failures: tuple[str, ...] = ()
+        self.offsets: dict[str, AbstractEffect] = {}
+        self.diagnoses: dict[tuple, Diagnosis] = {}
+
+    def visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
+        """A fitted model with its score, which is stored and drawn."""
+        model = self.judged(effects, fit)
+        self.visited.add(model)
+        self.watched.fitted(model)
+        return model
+
+    def judged(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
+        """A fitted model with its score, which is not stored."""
+        judged = score_of(fit, len(effects), self.forms)
+        left = over_recordings(fit.error_percent.to_numpy())
+        return Model(effects, judged.value, fit=fit, noise=judged.noise, left=left)
+
+    def added(self, fit: Fit) -> tuple[AbstractEffect, ...]:
+        """The effects of a fit that the starting model lacks; these are its last effects."""
+        start = self.visited.fitted(())
+        assert start is not None
+        assert start.fit is not None
+        return fit.loop.effects[len(start.fit.loop.effects) :]
+
+    def had(self, at: Model, effects: Sequence[AbstractEffect]) -> Model | None:
+        """An earlier refit of a set with the same held values released; None if there is none."""
+        had = self.visited.fitted(effects)
+        if had is None or had.fit is None or at.fit is None:
+            return None
+        one, other = had.fit.loop, at.fit.loop
+        alike = bool(eqx.tree_equal(one.controller, other.controller))
+        return had if alike and released_names(one) == released_names(other) else None
+
+    def refitted(self, at: Model, effects: Sequence[AbstractEffect]) -> Model:
+        """A fitted model with only some of its effects, fitted again from their current values."""
+        assert at.fit is not None
+        self.watched.begin("fit", f"fit with {listed(effects) or 'nothing'} alone")
+        fit = self.fits.exchanged(at.fit.loop, at.effects, effects, at.noise)
+        return self.visit(self.added(fit), fit)
