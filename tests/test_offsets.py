@@ -23,9 +23,9 @@ def sharp(v):
     return 2 / np.pi * np.arctan(v / EPS)
 
 
-def biased(seed: int, smooth: bool) -> jaxid.Recording:
+def biased(seed: int, smooth: bool, noise: float = 0.1) -> jaxid.Recording:
     """An axis with a constant torque, or with friction that is larger forward than backward."""
-    record = recorded(seed, sharp, noise=0.1)
+    record = recorded(seed, sharp, noise=noise)
     v = np.gradient(record.q[:, 0], record.time)
     more = SIZE * (sharp(v) ** 2 if smooth else np.ones_like(v))
     return dataclasses.replace(record, tau=record.tau + more[:, None])
@@ -65,9 +65,9 @@ def test_a_fit_without_an_offset_is_saved_under_its_own_name(monkeypatch):
     assert names[1] == f"{names[0]}, offset1 held"
 
 
-def searched(smooth: bool, **settings) -> jaxid.Discovery:
-    runs = [biased(k, smooth) for k in (1, 2)]
-    unseen = biased(3, smooth)
+def searched(smooth: bool, noise: float = 0.1, **settings) -> jaxid.Discovery:
+    runs = [biased(k, smooth, noise) for k in (1, 2)]
+    unseen = biased(3, smooth, noise)
     return jaxid.discover(axis(EPS), runs, validate=unseen, progress=False, **settings)
 
 
@@ -83,3 +83,13 @@ def test_friction_by_direction_is_named_and_an_offset_is_not():
     constant = searched(False)
     assert constant.verdict == "adequate"
     assert not any("offset" in note for note in constant.notes)
+
+
+@pytest.mark.slow
+def test_where_noise_hides_the_difference_both_have_a_weight():
+    found = searched(True, noise=2.0)
+    assert found.verdict == "adequate"
+    assert any("may also be asymmetric_friction" in note for note in found.notes)
+    row = found.models.set_index("model").loc["asymmetric_friction on joint 1"]
+    assert row["status"] == "predicted"
+    assert 1e-4 < row["weight"] < 0.5

@@ -1,13 +1,17 @@
 """Effects must explain stretches of the recordings from which they were not estimated."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from test_noise_floor import DURATION, RATE, axis
+from test_release import arctan, recorded
+from test_release import axis as drive
 
 import jaxid
 from jaxid.control import Tracking
 from jaxid.discovery.support import _errors
-from jaxid.effects import ThermalDrift
+from jaxid.effects import EndStop, Spring, ThermalDrift
 
 STRETCH = np.repeat(np.arange(6), 200)
 
@@ -45,3 +49,23 @@ def test_what_one_stretch_shows_is_not_believed():
         story = jaxid.discover(loop, record, catalogue=(ThermalDrift,), progress=False)
         added.append([s.added.effect_name() for s in story.steps if s.added])
     assert added == [["thermal_drift"], []]
+
+
+@pytest.mark.slow
+def test_a_stop_may_be_touched_once():
+    """Without its only contact its stiffness is unknown, but a stop is no error of one stretch."""
+    stiffness, angle = 400.0, 0.095
+    records = []
+    for seed in (3, 2):
+        record = recorded(seed, arctan, noise=0.1)
+        tau = record.tau + stiffness * np.maximum(record.q - angle, 0.0)
+        records.append(dataclasses.replace(record, tau=tau))
+    touched = np.flatnonzero(records[0].q[:, 0] > angle)
+    assert np.unique(touched * 6 // len(records[0].q)).size == 1
+    story = jaxid.discover(
+        drive(), records[0], validate=records[1], catalogue=(EndStop, Spring), progress=False
+    )
+    (added,) = story.to_dict()["added"]
+    assert added["effect"] == EndStop.effect_name()
+    assert added["parameters"]["stiffness"]["value"] == pytest.approx(stiffness, rel=0.1)
+    assert story.verdict == "explained"

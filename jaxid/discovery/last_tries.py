@@ -91,6 +91,8 @@ def without_offset(search: Examined, at: Model) -> Model | None:
             best = _better(search, best, (found.effect,), again)
         if found.loss < DECISIVE:
             search.offsets[found.name] = found.effect
+            score = at.score + found.loss + paid
+            search.visited.add(Model(effects, score, noise=found.noise, beyond=1))
     return best if best.score < at.score - LIKELY else None
 
 

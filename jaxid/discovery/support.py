@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..effects import AbstractEffect, AbstractTransmission, TorqueSaturation
+from ..effects import AbstractEffect
 from .explore import Candidate
 from .hypotheses import free_of
 from .predict import Predictor
@@ -27,8 +27,8 @@ def unsupported(predictor: Predictor, c: Candidate) -> tuple[AbstractEffect, ...
     The score assumes that the residual is noise with a stationary spectrum. On a real arm the
     residual of a rigid model depends on the motion, and an effect with many values can follow a
     stretch of it. Therefore each stretch is predicted in the linear system from values that are
-    estimated on all other stretches. Contacts and torque limits are not tested, because they can
-    act in a single stretch.
+    estimated on all other stretches. Effects that may act in a single stretch, such as stops and
+    torque limits (`local`), are not tested.
 
     **Arguments:**
 
@@ -39,8 +39,7 @@ def unsupported(predictor: Predictor, c: Candidate) -> tuple[AbstractEffect, ...
     return tuple(
         effect
         for k, effect in enumerate(c.effects)
-        if not isinstance(effect, AbstractTransmission | TorqueSaturation)
-        and _share(predictor, c, k, stretch) < _SUPPORTED
+        if not effect.local and _share(predictor, c, k, stretch) < _SUPPORTED
     )
 
 

@@ -172,6 +172,9 @@ def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
 def undetermined(found: Fit, added: int) -> tuple[AbstractEffect, ...]:
     """The effects, of those that a refit has added, of which the recordings determine no value.
 
+    A value is determined if its standard deviation is less than its size. If none is, other
+    parameters of the model can take the place of the effect.
+
     **Arguments:**
 
     - `added`: number of added effects; these are the loop's last ones.
@@ -179,9 +182,8 @@ def undetermined(found: Fit, added: int) -> tuple[AbstractEffect, ...]:
     effects = found.loop.effects
     last = range(len(effects) - added, len(effects))
     values = {k: [place for place, _ in _values_of(found.loop, k)] for k in last}
-    return tuple(
-        effects[k] for k, own in values.items() if own and not np.isfinite(found.std[own]).any()
-    )
+    known = found.std < np.abs(found.theta)
+    return tuple(effects[k] for k, own in values.items() if own and not known[own].any())
 
 
 def _values_of(loop: ClosedLoop, place: int) -> list[tuple[int, bool]]:

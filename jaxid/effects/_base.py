@@ -80,6 +80,8 @@ class AbstractEffect(eqx.Module):
       other effect is found twice on a joint, it approximates a different effect.
     - `contact`: parts separate and touch again. A fit with a wrong stiffness then converges to a
       wrong minimum, so the stiffness is estimated as well.
+    - `local`: it acts only in a part of the motion, such as a stop or a limit. That part may occur
+      once, and other stretches of the recordings then do not determine the effect.
     """
 
     inertial: ClassVar[bool] = False
@@ -90,6 +92,7 @@ class AbstractEffect(eqx.Module):
     joint_fields: ClassVar[tuple[str, ...]] = ()
     several: ClassVar[bool] = False
     contact: ClassVar[bool] = False
+    local: ClassVar[bool] = False
 
     @classmethod
     def effect_name(cls) -> str:
@@ -163,6 +166,7 @@ class AbstractTransmission(AbstractEffect):
     joint: eqx.AbstractVar[int]
     rotor: eqx.AbstractVar[Scalar]
     finite = True
+    local = True
 
     def initial_state(self) -> Float[Array, " states"]:
         """No twist, at rest."""

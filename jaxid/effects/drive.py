@@ -115,6 +115,7 @@ class TorqueSaturation(AbstractEffect):
         jnp.inf, symbol="limit", unit="N·m", lower=0.0, scale=1.0, linear=False
     )
     finite = True
+    local = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["TorqueSaturation"]:

@@ -81,6 +81,7 @@ class EndStop(AbstractEffect):
     angle: Scalar = parameter(0.0, symbol="qe", unit="rad", scale=0.1, linear=False)
     side: int = eqx.field(static=True, default=1)
     on_link = True
+    local = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["EndStop"]:
