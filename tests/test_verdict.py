@@ -124,6 +124,19 @@ def test_what_noise_does_not_account_for_is_no_verdict(found):
     assert "of joint 2" in said
 
 
+def test_a_further_effect_that_is_probable_is_undecided(offset_story):
+    fit = offset_story[0].fit
+    offset, spring = TorqueOffset(joint=2), Spring(joint=1)
+    start, chosen = Model((), 0.0), Model((offset,), -50.0, fit=fit)
+    more = Model((offset, spring), -55.0, fit=fit)
+    said = undecided([more, chosen, start], chosen, {})
+    assert "a further effect have a probability of 0.924, most of all spring on joint 1" in said
+    # Not if it was only predicted, or if it is worse.
+    assert undecided([dataclasses.replace(more, fit=None), chosen, start], chosen, {}) == ""
+    worse = dataclasses.replace(more, score=-49.0)
+    assert undecided([chosen, worse, start], chosen, {}) == ""
+
+
 def test_a_start_that_shares_the_weight_is_undecided():
     start, rival = Model((), 100.0), Model((TorqueOffset(joint=2),), 98.0)
     models = [dataclasses.replace(rival, weight=0.73), dataclasses.replace(start, weight=0.27)]

@@ -13,6 +13,7 @@ from .diagnosis import Diagnosis, over_recordings
 from .fits import Fits, released_names
 from .likelihood import score_of
 from .models import Model, Visited, listed
+from .offsets import held_offsets
 from .predict import Predictor
 from .verify import Refits
 from .watched import Watched
@@ -57,10 +58,21 @@ class Examined:
         return model
 
     def judged(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
-        """A fitted model with its score, which is not stored."""
-        judged = score_of(fit, len(effects), self.forms)
+        """A fitted model with its score, which is not stored.
+
+        An effect in the place of an offset of the starting model is not a further effect.
+        """
+        size = max(len(effects) - self._left_out(fit), 0)
+        judged = score_of(fit, size, self.forms)
         left = over_recordings(fit.error_percent.to_numpy())
         return Model(effects, judged.value, fit=fit, noise=judged.noise, left=left)
+
+    def _left_out(self, fit: Fit) -> int:
+        """The number of offsets of the starting model that a fit leaves out."""
+        start = self.visited.fitted(())
+        if start is None or start.fit is None:
+            return 0
+        return len(set(held_offsets(fit.loop)) - set(held_offsets(start.fit.loop)))
 
     def added(self, fit: Fit) -> tuple[AbstractEffect, ...]:
         """The effects of a fit that the starting model lacks; these are its last effects."""

@@ -12,7 +12,6 @@ from ..simulation.dynamics import imposed
 from .examined import Examined
 from .explore import DECISIVE, key_of
 from .landscape import form
-from .likelihood import price
 from .models import LIKELY, Model, listed
 from .offsets import instead_of_offsets
 from .signs import reshaped
@@ -79,20 +78,18 @@ def without_offset(search: Examined, at: Model) -> Model | None:
     offered = AsymmetricFriction in search.asked.catalogue
     if len(at.effects) >= search.asked.most or not offered or fit is not at.fit:
         return None
-    size = len(at.effects) + 1
-    paid = price(size, search.forms) - price(size - 1, search.forms)
     best = at
     for found in instead_of_offsets(predictor, fit.std)[:_RIVALS]:
         effects = (*at.effects, found.effect)
         known = search.visited.fitted(effects) or search.small.intersection(key_of(effects))
-        if found.loss + paid < LIKELY and not known:
+        if found.loss < LIKELY and not known:
             asked = found.loop, at.effects, effects, found.noise
             again = partial(search.fits.exchanged, *asked, near=True)
             best = _better(search, best, (found.effect,), again)
         if found.loss < DECISIVE:
             search.offsets[found.name] = found.effect
-            score = at.score + found.loss + paid
-            search.visited.add(Model(effects, score, noise=found.noise, beyond=1))
+            predicted = Model(effects, at.score + found.loss, noise=found.noise, beyond=1)
+            search.visited.add(predicted)
     return best if best.score < at.score - LIKELY else None
 
 

@@ -29,7 +29,7 @@ class Instead(eqx.Module):
     - `name`: name of the offset.
     - `effect`: the friction, with its predicted values.
     - `rest`: the residual. `noise`: its noise filters.
-    - `loss`: increase of the score, without the price of the choice.
+    - `loss`: increase of the score. Its number of effects is the same, so the price is too.
     """
 
     loop: ClosedLoop

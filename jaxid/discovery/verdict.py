@@ -1,5 +1,6 @@
 """Tests that the final model must pass; otherwise the verdict is `undetermined`."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
@@ -15,6 +16,7 @@ from .diagnosis import Diagnosis, over_recordings
 from .explore import DECISIVE
 from .floor import SPOKEN, Floor, floor_of
 from .hypotheses import effect_on
+from .likelihood import weights
 from .models import LIKELY, Model, Named, probability
 from .relevance import REFUTED, allowed
 from .score import spanned
@@ -70,7 +72,7 @@ def undecided(
             f"{rival.label} has {rival.weight:.2g}: record more, or longer"
         )
     if chosen.score < start.score - LIKELY:
-        return _improbable(models, chosen, alike)
+        return _improbable(models, chosen, alike) or _incomplete(models, chosen)
     return (
         f"the score of the starting model is only {start.score - chosen.score:.2g} larger "
         f"({LIKELY:.0f} are odds of 20 to 1): record more, or longer"
@@ -92,6 +94,21 @@ def _improbable(
                 f"all {rival.label}: record other motions, or choose a model from the table"
             )
     return ""
+
+
+def _incomplete(models: Sequence[Model], chosen: Model) -> str:
+    """The reason if a further effect is probable, although not by odds of 20 to 1."""
+    mine = Counter(chosen.key)
+    more = [m for m in models if m.fit is not None and m.curve is None and mine < Counter(m.key)]
+    best = min(more, key=lambda m: m.score, default=chosen)
+    share = 1.0 - float(weights([m.score for m in (chosen, *more)])[0])
+    if share < _HALF:
+        return ""
+    (further, *_) = (Counter(best.names) - Counter(chosen.names)).elements()
+    return (
+        f"models with a further effect have a probability of {share:.3g}, most of all "
+        f"{effect_on(*further)}: record more, or longer"
+    )
 
 
 def refuted(
