@@ -212,6 +212,23 @@ def test_an_effect_that_was_too_small_is_not_added_again(offset_case, offset_sto
 
 
 @pytest.mark.xdist_group("offset")
+def test_a_set_without_support_is_no_rival(offset_case, offset_story, monkeypatch):
+    search, start = search_of(offset_case), offset_story[0].steps[0]
+    at = search.visit((), start.fit)
+    candidates, nothing = search._predicted(at)
+    best, *others = [c for c in candidates if c.effects]
+    monkeypatch.setattr("jaxid.discovery.search.imposed", lambda _: True)
+    lacking = lambda _, c: c.effects if c.key == best.key else ()  # noqa: E731
+    monkeypatch.setattr("jaxid.discovery.search.unsupported", lacking)
+    monkeypatch.setattr(search, "_fitted", lambda *_: None)
+    assert search._verified(at, candidates, nothing) is None
+    known = {m.key for m in search.visited.ranked()}
+    assert best.key not in known
+    assert {c.key for c in others} <= known
+    assert any("does not explain stretches" in note for note in search.failures)
+
+
+@pytest.mark.xdist_group("offset")
 def test_a_close_rival_that_was_only_predicted_is_fitted(offset_case, offset_story):
     """A weak spring in the place of the offset; the prediction puts the offset slightly behind."""
     search, start = search_of(offset_case), offset_story[0].steps[0]

@@ -51,6 +51,8 @@ class Search(Examined):
     removed: tuple[Named, ...] = ()
     # Linear system and diagnosis of the current fit, until a prediction has used them.
     latest: tuple[Screened, Diagnosis] | None = None
+    # Sets of the last prediction of which an effect does not explain stretches that were left out.
+    unsupported: frozenset[tuple] = frozenset()
 
     def run(self, loop: ClosedLoop) -> tuple[Outcome, bool]:
         """Predicts and verifies in rounds, until no model has a lower score.
@@ -197,6 +199,7 @@ class Search(Examined):
         """The best refit of the best predicted sets; None if none is better than the model."""
         plain = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
         full = len(at.effects) >= self.asked.most
+        self.unsupported = frozenset()
         tried = [] if full else self._to_fit(plain, nothing)
         # Effects that explain much less than one curve only approximate the curve.
         alone = [c for c in candidates if c.curve is not None and not c.effects]
@@ -217,7 +220,9 @@ class Search(Examined):
         ]
         best = min(better, key=lambda pair: pair[0].score, default=None)
         anchor = at.score - nothing if best is None else best[0].score - best[1].score
-        self.visited.add_predicted(candidates, at, anchor, self._left_by)
+        # A set without support is no rival of the chosen one.
+        rivals = [c for c in candidates if c.key not in self.unsupported]
+        self.visited.add_predicted(rivals, at, anchor, self._left_by)
         return None if best is None else best[0]
 
     def _to_fit(self, plain: Sequence[Candidate], nothing: float) -> list[Candidate]:
@@ -247,6 +252,7 @@ class Search(Examined):
         fit, predictor = self.seen
         lacking = unsupported(predictor, c) if imposed(fit.loop) else ()
         if lacking:
+            self.unsupported |= {c.key}
             said = (
                 f"{listed(lacking)}: does not explain stretches that were left out of its estimate"
             )
