@@ -264,11 +264,12 @@ def test_a_fitted_elasticity_may_be_a_gap(offset_case):
 def test_every_added_effect_must_be_determined(offset_case, offset_story):
     start = offset_story[0].steps[0]
     fit = with_chain(offset_case, start, TorqueOffset(joint=2), QuadraticDrag(joint=1))[-1].fit
-    assert undetermined(fit, 2) == ()
-    covariance = fit.covariance.copy()
-    covariance[-1, -1] = np.inf
-    loose = dataclasses.replace(fit, covariance=covariance)
-    assert undetermined(loose, 2) == undetermined(loose, 1) == fit.loop.effects[-1:]
+    # A value is determined if its deviation is smaller than the value itself.
+    for std, loose in ((0.5, False), (2.0, True), (np.inf, True)):
+        covariance = fit.covariance.copy()
+        covariance[-1, -1] = (std * fit.theta[-1]) ** 2
+        known = dataclasses.replace(fit, covariance=covariance)
+        assert undetermined(known, 2) == (fit.loop.effects[-1:] if loose else ())
 
 
 @pytest.mark.xdist_group("offset")
