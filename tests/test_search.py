@@ -264,12 +264,15 @@ def test_a_fitted_elasticity_may_be_a_gap(offset_case):
 def test_every_added_effect_must_be_determined(offset_case, offset_story):
     start = offset_story[0].steps[0]
     fit = with_chain(offset_case, start, TorqueOffset(joint=2), QuadraticDrag(joint=1))[-1].fit
+    offset, drag = fit.loop.effects[-2:]
+    # The drag is not there, so its coefficient is at its bound, zero.
+    assert undetermined(fit, 2) == (drag,)
+    assert undetermined(fit, 1) == (drag,)
     # A value is determined if its deviation is smaller than the value itself.
-    for std, loose in ((0.5, False), (2.0, True), (np.inf, True)):
+    for std, found in ((0.5, (drag,)), (2.0, (offset, drag)), (np.inf, (offset, drag))):
         covariance = fit.covariance.copy()
-        covariance[-1, -1] = (std * fit.theta[-1]) ** 2
-        known = dataclasses.replace(fit, covariance=covariance)
-        assert undetermined(known, 2) == (fit.loop.effects[-1:] if loose else ())
+        covariance[-2, -2] = (std * fit.theta[-2]) ** 2
+        assert undetermined(dataclasses.replace(fit, covariance=covariance), 2) == found
 
 
 @pytest.mark.xdist_group("offset")
