@@ -218,8 +218,10 @@ def test_a_set_without_support_is_no_rival(offset_case, offset_story, monkeypatc
     candidates, nothing = search._predicted(at)
     best, *others = [c for c in candidates if c.effects]
     monkeypatch.setattr("jaxid.discovery.search.imposed", lambda _: True)
-    lacking = lambda _, c: c.effects if c.key == best.key else ()  # noqa: E731
-    monkeypatch.setattr("jaxid.discovery.search.unsupported", lacking)
+    monkeypatch.setattr(
+        "jaxid.discovery.search.unsupported",
+        lambda _, c: c.effects if c.key == best.key else (),
+    )
     monkeypatch.setattr(search, "_fitted", lambda *_: None)
     assert search._verified(at, candidates, nothing) is None
     known = {m.key for m in search.visited.ranked()}

@@ -80,16 +80,14 @@ def without_offset(search: Examined, at: Model) -> Model | None:
         return None
     best = at
     for found in instead_of_offsets(predictor, fit.std)[:_RIVALS]:
+        if found.loss > DECISIVE:
+            continue
+        search.offsets[found.name] = found.effect
         effects = (*at.effects, found.effect)
-        known = search.visited.fitted(effects) or search.small.intersection(key_of(effects))
-        if found.loss < LIKELY and not known:
+        if not (search.visited.fitted(effects) or search.small.intersection(key_of(effects))):
             asked = found.loop, at.effects, effects, found.noise
             again = partial(search.fits.exchanged, *asked, near=True)
             best = _better(search, best, (found.effect,), again)
-        if found.loss < DECISIVE:
-            search.offsets[found.name] = found.effect
-            predicted = Model(effects, at.score + found.loss, noise=found.noise, beyond=1)
-            search.visited.add(predicted)
     return best if best.score < at.score - LIKELY else None
 
 

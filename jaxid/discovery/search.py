@@ -52,7 +52,7 @@ class Search(Examined):
     # Linear system and diagnosis of the current fit, until a prediction has used them.
     latest: tuple[Screened, Diagnosis] | None = None
     # Sets of the last prediction of which an effect does not explain stretches that were left out.
-    unsupported: frozenset[tuple] = frozenset()
+    without_support: frozenset[tuple] = frozenset()
 
     def run(self, loop: ClosedLoop) -> tuple[Outcome, bool]:
         """Predicts and verifies in rounds, until no model has a lower score.
@@ -199,7 +199,7 @@ class Search(Examined):
         """The best refit of the best predicted sets; None if none is better than the model."""
         plain = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
         full = len(at.effects) >= self.asked.most
-        self.unsupported = frozenset()
+        self.without_support = frozenset()
         tried = [] if full else self._to_fit(plain, nothing)
         # Effects that explain much less than one curve only approximate the curve.
         alone = [c for c in candidates if c.curve is not None and not c.effects]
@@ -221,7 +221,7 @@ class Search(Examined):
         best = min(better, key=lambda pair: pair[0].score, default=None)
         anchor = at.score - nothing if best is None else best[0].score - best[1].score
         # A set without support is no rival of the chosen one.
-        rivals = [c for c in candidates if c.key not in self.unsupported]
+        rivals = [c for c in candidates if c.key not in self.without_support]
         self.visited.add_predicted(rivals, at, anchor, self._left_by)
         return None if best is None else best[0]
 
@@ -252,7 +252,7 @@ class Search(Examined):
         fit, predictor = self.seen
         lacking = unsupported(predictor, c) if imposed(fit.loop) else ()
         if lacking:
-            self.unsupported |= {c.key}
+            self.without_support |= {c.key}
             said = (
                 f"{listed(lacking)}: does not explain stretches that were left out of its estimate"
             )

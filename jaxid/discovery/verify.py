@@ -172,8 +172,8 @@ def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
 def undetermined(found: Fit, added: int) -> tuple[AbstractEffect, ...]:
     """The effects, of those that a refit has added, of which the recordings determine no value.
 
-    A value is determined if its standard deviation is less than its size. If none is, other
-    parameters of the model can take the place of the effect.
+    A value is determined if its standard deviation is less than its size. If none is, the effect
+    is absent, or other parameters of the model can take its place.
 
     **Arguments:**
 
