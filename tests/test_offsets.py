@@ -23,11 +23,11 @@ def sharp(v):
     return 2 / np.pi * np.arctan(v / EPS)
 
 
-def biased(seed: int, smooth: bool, noise: float = 0.1) -> jaxid.Recording:
+def biased(seed: int, smooth: bool, noise: float = 0.1, viscous: float = 0.0) -> jaxid.Recording:
     """An axis with a constant torque, or with friction that is larger forward than backward."""
     record = recorded(seed, sharp, noise=noise)
     v = np.gradient(record.q[:, 0], record.time)
-    more = SIZE * (sharp(v) ** 2 if smooth else np.ones_like(v))
+    more = SIZE * (sharp(v) ** 2 if smooth else np.ones_like(v)) + viscous * v * sharp(v)
     return dataclasses.replace(record, tau=record.tau + more[:, None])
 
 
@@ -42,10 +42,23 @@ def test_friction_by_direction_replaces_an_offset_that_absorbed_it():
     assert float(found.effect.coulomb) == pytest.approx(SIZE, rel=0.02)
     assert held_offsets(found.loop) == ["offset1"]
     assert float(found.loop.effects[2].level) == 0.0
+    # The friction does not differ in its viscous part, which is not estimated.
+    assert found.loop.effects[3] is found.effect
+    assert found.loop.held_names == {"offset1", "dFv1"}
+    assert float(found.effect.viscous) == 0.0
     # An offset that is not significant is not examined, nor one that the user holds.
     assert instead_of_offsets(seen, 1e3 * values(seen)) == []
     held = predictor([biased(1, True)], axis(EPS).hold("offset1"))
     assert instead_of_offsets(held, values(held)) == []
+
+
+def test_a_viscous_part_that_explains_its_price_is_estimated():
+    runs = [biased(seed, True, viscous=1.5) for seed in (1, 2)]
+    seen = predictor(runs, axis(EPS))
+    (found,) = instead_of_offsets(seen, values(seen))
+    assert found.loop.held_names == {"offset1"}
+    assert float(found.effect.viscous) == pytest.approx(1.5, rel=0.05)
+    assert float(found.effect.coulomb) == pytest.approx(SIZE, rel=0.05)
 
 
 def test_an_offset_stays_where_the_torque_is_constant():
@@ -91,6 +104,6 @@ def test_where_noise_hides_the_difference_both_have_a_weight():
     assert found.verdict == "adequate"
     assert any("may also be asymmetric_friction" in note for note in found.notes)
     weights = found.models.set_index("model")["weight"]
-    # Neither has a price that the other has not.
-    assert 0.05 < weights["asymmetric_friction on joint 1"] < 0.5
+    # Neither has a price that the other has not, so the friction that is there has more weight.
+    assert 0.5 < weights["asymmetric_friction on joint 1"] < 0.95
     assert weights.sum() == pytest.approx(1.0)

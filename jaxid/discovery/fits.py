@@ -9,7 +9,6 @@ from ..noise import ARFilter
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
 from .models import piece_name
-from .offsets import held_offsets
 from .release import Release
 from .verify import Refits
 
@@ -80,7 +79,6 @@ class Fits:
         had: Sequence[AbstractEffect],
         effects: Sequence[AbstractEffect],
         noise: Sequence[ARFilter],
-        near: bool = False,
     ) -> Fit:
         """The fit of a model with other effects, from their current values.
 
@@ -90,21 +88,20 @@ class Fits:
         **Arguments:**
 
         - `had`: effects of the loop over the starting model. `effects`: those in their place.
-        - `near`: whether the new effects are near their optimum, so that one fit suffices.
         """
         kept = [e for e in loop.effects if not any(e is x for x in had)]
         start, refits = loop.with_effects((*kept, *effects)), self._refits
         new = not all(any(e is x for x in had) for e in effects)
 
         def better() -> Fit:
-            plain = [refits.unfiltered(start, noise).loop] if new and not near else []
+            plain = [refits.unfiltered(start, noise).loop] if new else []
             return refits.best([refits.filtered(x, noise) for x in (start, *plain)])
 
         name = f"{piece_name(effects)}, {'instead' if new else 'alone'}"
         return self._saved(name, loop, better)
 
     def _saved(self, name: str, loop: ClosedLoop, work: Callable[[], Fit]) -> Fit:
-        """A fit under a name that contains the released values and the held offsets of its loop.
+        """A fit under a name that contains the released and the held values of its loop.
 
         **Arguments:**
 
@@ -112,7 +109,7 @@ class Fits:
         """
         late = getattr(loop.controller, "delay", 0.0)
         parts = [f"{x} free" for x in sorted(released_names(loop))]
-        parts += [f"{x} held" for x in held_offsets(loop)]
+        parts += [f"{x} held" for x in sorted(loop.held_names)]
         parts += [f"delay {late:.9g}"] if late else []
         return self._campaign.piece(", ".join([f"{self._prefix}{name}", *parts]), work)
 

@@ -114,22 +114,28 @@ class Landscape(eqx.Module):
             least = found[name].evidence if name in found else -np.inf
             if explained[place] - price[place] > least:
                 own = score[list(hypothesis.columns)]
-                entry = self._entry(hypothesis, inner[place], own, float(price[place]))
+                size = self.gram.size[list(hypothesis.columns)]
+                entry = _entry(hypothesis, inner[place], own, size, float(price[place]))
                 if entry is not None and entry.evidence > least:
                     found[name] = entry
         return sorted(found.values(), key=lambda e: -e.evidence)
 
-    def _entry(
-        self, hypothesis: Hypothesis, gram: np.ndarray, score: np.ndarray, price: float
-    ) -> Entry | None:
-        """A hypothesis with amplitudes inside their bounds; None if all of them are at a bound."""
-        size = self.gram.size[list(hypothesis.columns)]
-        limits = hypothesis.lower, hypothesis.upper
-        amplitude, explained = bounded_amplitudes(gram, score, size, limits)
-        if not explained > 0.0:
-            return None
-        effect = _sized(hypothesis.effect, amplitude)
-        return Entry(hypothesis, float(explained - price), effect)
+
+# Not a method: equinox traverses a module, here thousands of hypotheses, for each call of a method.
+def _entry(
+    hypothesis: Hypothesis,
+    gram: Float[np.ndarray, "columns columns"],
+    score: Float[np.ndarray, " columns"],
+    size: Float[np.ndarray, " columns"],
+    price: float,
+) -> Entry | None:
+    """A hypothesis with amplitudes inside their bounds; None if all of them are at a bound."""
+    limits = hypothesis.lower, hypothesis.upper
+    amplitude, explained = bounded_amplitudes(gram, score, size, limits)
+    if not explained > 0.0:
+        return None
+    effect = _sized(hypothesis.effect, amplitude)
+    return Entry(hypothesis, float(explained - price), effect)
 
 
 def forms_of(hypotheses: Sequence[Hypothesis]) -> int:

@@ -85,8 +85,7 @@ def without_offset(search: Examined, at: Model) -> Model | None:
         search.offsets[found.name] = found.effect
         effects = (*at.effects, found.effect)
         if not (search.visited.fitted(effects) or search.small.intersection(key_of(effects))):
-            asked = found.loop, at.effects, effects, found.noise
-            again = partial(search.fits.exchanged, *asked, near=True)
+            again = partial(search.fits.exchanged, found.loop, effects, effects, found.noise)
             best = _better(search, best, (found.effect,), again)
     return best if best.score < at.score - LIKELY else None
 

@@ -9,10 +9,11 @@ from jaxtyping import Float
 
 from ..effects import AbstractEffect, AsymmetricFriction, TorqueOffset
 from ..noise import ARFilter
-from ..parameters import Parameter
+from ..parameters import Parameter, read_values
 from ..simulation.loop import ClosedLoop
-from .likelihood import score
-from .predict import Predictor
+from .hypotheses import free_of
+from .likelihood import Score, score
+from .predict import Prediction, Predictor
 from .signs import shapes_of_signs
 
 # Smallest offset for which this is examined, in standard deviations.
@@ -23,19 +24,19 @@ class Instead(eqx.Module):
     """A model with friction that differs by direction in place of an offset, as predicted.
 
     Both torques are constant except near reversals and at rest, so a fitted offset absorbs most of
-    such a friction, and what is left is too small to be found.
+    such a friction, and what is left is too small to be found. If the viscous part does not explain
+    its price, it is held at zero, and the friction has as many values as the offset.
 
-    - `loop`: the loop without the offset.
+    - `loop`: the loop with the friction, and with the offset held at zero.
     - `name`: name of the offset.
     - `effect`: the friction, with its predicted values.
-    - `rest`: the residual. `noise`: its noise filters.
+    - `noise`: noise filters of the residual.
     - `loss`: increase of the score. Its number of effects is the same, so the price is too.
     """
 
     loop: ClosedLoop
     name: str = eqx.field(static=True)
     effect: AbstractEffect
-    rest: Float[np.ndarray, "recordings samples outputs"]
     noise: tuple[ARFilter, ...]
     loss: float
 
@@ -51,7 +52,7 @@ def instead_of_offsets(predictor: Predictor, std: Float[np.ndarray, " values"]) 
     loop = predictor.system.loop
     smoothing, form = shapes_of_signs(loop)
     plain = predictor.predict([])
-    now = score(predictor.data, plain.rest, plain.freedom, 0, 0).value
+    now = _score(predictor, plain.rest, plain.freedom).value
     found = []
     for p, place, joint in _offsets(loop):
         value = float(p.where(loop))
@@ -61,10 +62,20 @@ def instead_of_offsets(predictor: Predictor, std: Float[np.ndarray, " values"]) 
         sign = {"smoothing": float(smoothing[joint - 1]), "form": float(form[joint - 1])}
         there = without.predict([AsymmetricFriction(joint=joint, **sign)])
         if there.possible:
-            then = score(without.data, there.rest, there.freedom, 0, 0)
-            own = without.system.loop, p.name, there.effects[0]
-            found.append(Instead(*own, there.rest, then.noise, then.value - now))
+            effect, then = there.effects[0], _score(without, there.rest, there.freedom)
+            loop = without.system.loop.add(effect)
+            coulomb, rest = _coulomb_alone(without, there)
+            alone = _score(without, rest, there.freedom - 1)
+            if alone.value < then.value:
+                effect, then = AsymmetricFriction(joint=joint, coulomb=coulomb, **sign), alone
+                loop = _without_viscous(without.system.loop.add(effect))
+            found.append(Instead(loop, p.name, effect, then.noise, then.value - now))
     return sorted(found, key=lambda x: x.loss)
+
+
+def replaces_offset(loop: ClosedLoop, other: ClosedLoop) -> bool:
+    """Whether a loop has no offset where another one estimates it."""
+    return bool({*held_offsets(loop)} - {*held_offsets(other)})
 
 
 def held_offsets(loop: ClosedLoop) -> list[str]:
@@ -87,6 +98,38 @@ def _offsets(loop: ClosedLoop) -> Iterator[tuple[Parameter, int, int]]:
         if isinstance(effect, TorqueOffset) and effect.joint not in had:
             yield p, place, effect.joint
         place += p.size
+
+
+def _coulomb_alone(
+    without: Predictor, both: Prediction
+) -> tuple[float, Float[np.ndarray, "recordings samples outputs"]]:
+    """The Coulomb part of a predicted friction without its viscous part, and the residual."""
+    (friction,) = both.effects
+    assert isinstance(friction, AsymmetricFriction)
+    own = free_of(friction)
+    at = [p.place for p in own].index(("coulomb",))
+    # The torque is linear in both values.
+    values = np.asarray(read_values(friction, own))
+    column, left = both.slopes[:, at], both.residual + both.slopes @ values
+    coulomb = float(column @ left) / max(float(column @ column), 1e-300)
+    data, base = without.data, without.system.base
+    rest = data.residual - coulomb * both.moved[..., at]
+    return coulomb, (rest - base @ without.absorbed(rest)) * data.mask[..., None]
+
+
+def _without_viscous(loop: ClosedLoop) -> ClosedLoop:
+    """The loop with the viscous part of its last effect held."""
+    place = "effects", len(loop.effects) - 1, "viscous"
+    return loop.hold(*(p.name for p in loop.parameters if p.place == place))
+
+
+def _score(
+    predictor: Predictor,
+    rest: Float[np.ndarray, "recordings samples outputs"],
+    freedom: int,
+) -> Score:
+    """The score of a predicted model without the price of its effects."""
+    return score(predictor.data, rest, freedom, 0, 0)
 
 
 def _without(predictor: Predictor, p: Parameter, place: int, value: float) -> Predictor:
