@@ -69,7 +69,8 @@ def test_friction_that_varies_with_position_is_shown_over_position():
     assert found.torque[inside] == pytest.approx(np.array(expected)[inside], abs=0.1 * size)
 
 
-def test_a_story_draws_what_it_found(bump_story, offset_story):
+@pytest.mark.xdist_group("offset")
+def test_a_story_draws_what_it_found(offset_story):
     story, _ = offset_story
     name = story.steps[-1].added.effect_name()
     found = story.curve(name, 2, story.steps[-1].held_out.recordings)

@@ -125,3 +125,44 @@ def test_no_effect_is_searched_before_a_mistake_is_corrected(clean):
     assert story.verdict == "undetermined"
     assert len(story.steps) == 1
     assert re.search(f"{said}.*no effect was searched", story.reason)
+
+
+PENDULUM = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial>
+<origin xyz="0 0 -0.4"/><mass value="2.0"/>
+<inertia ixx="0.05" iyy="0.05" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="pivot" type="continuous"><parent link="base"/><child link="rod"/>
+<axis xyz="0 1 0"/></joint></robot>"""
+INERTIA, WEIGHT = 0.05 + 2.0 * 0.4**2, 2.0 * 9.81 * 0.4
+
+
+def swung(seed: int, faster: float = 1.0, times: float = 1.0) -> jaxid.Recording:
+    """A pendulum that is moved by sines, with a clock that is `faster`, and inertia `times`."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, 10.0, 0.005)
+    sizes, rates, phases = np.array([0.5, 0.2]), np.array([2.0, 5.1]), rng.uniform(0, 6, 2)
+    q, v, a = (
+        (sizes * rates**k * np.sin(rates * time[:, None] + phases + k * np.pi / 2)).sum(axis=1)
+        for k in range(3)
+    )
+    tau = times * INERTIA * a + WEIGHT * np.sin(q) + 0.2 * v + 0.3 * np.tanh(v / 0.01)
+    tau = tau + 0.03 * rng.normal(size=len(time))
+    return jaxid.Recording.from_arrays(time / faster, q[:, None], tau[:, None], name=f"run{seed}")
+
+
+@pytest.mark.parametrize(
+    ("faster", "times", "share"),
+    [(1.0, 1.0, None), (2.0, 1.0, 0.25), (1.0, 0.7, None), (1.0, 3.0, None), (1.0, 0.4, 0.4)],
+)
+def test_bodies_much_lighter_than_drawn_are_doubtful(faster, times, share):
+    """A wrong clock does not raise the error if bodies are estimated."""
+    runs = [swung(seed, faster, times) for seed in (1, 2)]
+    found = jaxid.fit(jaxid.serial(PENDULUM, bodies="free"), runs, jaxid.OEM(progress=False))
+    assert found.error_percent.to_numpy().max() < 3
+    if share is None:
+        assert found.mistake == ""
+        return
+    said = re.fullmatch(
+        "the estimated inertia is (.*) of that of the bodies in the file: .*", found.mistake
+    )
+    assert float(said.group(1)) == pytest.approx(share, rel=0.05)
+    assert "clock" in found.mistake

@@ -4,19 +4,17 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from ..arms import AbstractArm
-from ..compiling import compiled
 from ..effects import AbstractEffect, Curve, Motion, Scene, check_declared
 from ..effects import catalogue as known
 from ..effects.curve import curve_over
 from ..errors import FitError, ModelError
 from ..parameters import Parameter, list_parameters
 from ..recording import Recordings
+from ..simulation.inertia import mass_matrices
 from ..simulation.loop import ClosedLoop
 from .signs import shapes_of_signs
 
@@ -104,15 +102,9 @@ def survey(
     )
 
 
-# Positions at which inertia is averaged.
-_POSITIONS = 64
-
-
 def _inertia(loop: ClosedLoop, q: Float[np.ndarray, "positions joints"]) -> Float[np.ndarray, "_"]:
     """Inertia of each joint while the others are free to move, averaged over positions."""
-    # Always so many positions, for one program.
-    chosen = np.linspace(0, len(q) - 1, _POSITIONS).astype(int)
-    mass = np.asarray(_mass_matrices(loop.arm, jax.device_put(q[chosen])))
+    mass = mass_matrices(loop.arm, q)
     # Rotors are effects: without them a wrist with drawn bodies may have almost no inertia.
     mass = mass + 1e-6 * np.trace(mass, axis1=1, axis2=2)[:, None, None] * np.eye(loop.joints)
     try:
@@ -123,13 +115,6 @@ def _inertia(loop: ClosedLoop, q: Float[np.ndarray, "positions joints"]) -> Floa
             "its unit"
         ) from error
     return 1 / np.mean(np.diagonal(freed, axis1=1, axis2=2), axis=0)
-
-
-@compiled
-def _mass_matrices(
-    arm: AbstractArm, q: Float[Array, "positions joints"]
-) -> Float[Array, "positions joints joints"]:
-    return jax.vmap(arm.mass_matrix)(q)
 
 
 def curves(scene: Scene, motion: Motion, knots: int = 12) -> list[Curve]:

@@ -17,7 +17,7 @@ from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
 from ..simulation.batch import at_rest, check_joints, check_law
 from ..simulation.loop import ClosedLoop
-from .mistakes import LARGE_PERCENT, likely_mistake
+from .mistakes import LARGE_PERCENT, lighter_than_drawn, likely_mistake
 from .oem import OEM, oem_of
 from .result import DOUBTFUL_PERCENT, AbstractMethod, Fit, Status
 from .standstill import raised, slow_note
@@ -172,7 +172,7 @@ def _without_nan(found: Fit) -> Fit:
 
 
 def _examined(found: Fit, loop: ClosedLoop) -> Fit:
-    """The fit with the likely mistake in its recordings, if it leaves much of a joint's torque.
+    """The fit with the likely mistake in its recordings, if there is one.
 
     A fit from given values continues another fit of the same recordings, which was examined.
 
@@ -180,10 +180,11 @@ def _examined(found: Fit, loop: ClosedLoop) -> Fit:
 
     - `loop`: the model at its start values, because an effect that fits a mistake may hide it.
     """
-    largest = float((found.error_percent * _of_motion(found)).to_numpy().max())
-    if largest < LARGE_PERCENT or oem_of(found).start == "given":
+    if oem_of(found).start == "given":
         return found
-    mistake = likely_mistake(loop, found.recordings)
+    largest = float((found.error_percent * _of_motion(found)).to_numpy().max())
+    mistake = likely_mistake(loop, found.recordings) if largest > LARGE_PERCENT else ""
+    mistake = mistake or lighter_than_drawn(found)
     notes = (mistake, *found.notes) if mistake else found.notes
     return dataclasses.replace(found, mistake=mistake, notes=notes)
 
