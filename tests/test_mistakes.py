@@ -135,8 +135,11 @@ PENDULUM = """<robot name="pendulum"><link name="base"/><link name="rod"><inerti
 INERTIA, WEIGHT = 0.05 + 2.0 * 0.4**2, 2.0 * 9.81 * 0.4
 
 
-def swung(seed: int, faster: float = 1.0, times: float = 1.0) -> jaxid.Recording:
-    """A pendulum that is moved by sines, with a clock that is `faster`, and inertia `times`."""
+def swung(seed: int, faster: float = 1.0, times: float = 1.0, zero: float = 0.0) -> jaxid.Recording:
+    """A pendulum moved by sines, with a clock that is `faster`, and inertia `times` the drawn one.
+
+    It hangs at `zero`, and according to the file at 0.
+    """
     rng = np.random.default_rng(seed)
     time = np.arange(0.0, 10.0, 0.005)
     sizes, rates, phases = np.array([0.5, 0.2]), np.array([2.0, 5.1]), rng.uniform(0, 6, 2)
@@ -144,7 +147,7 @@ def swung(seed: int, faster: float = 1.0, times: float = 1.0) -> jaxid.Recording
         (sizes * rates**k * np.sin(rates * time[:, None] + phases + k * np.pi / 2)).sum(axis=1)
         for k in range(3)
     )
-    tau = times * INERTIA * a + WEIGHT * np.sin(q) + 0.2 * v + 0.3 * np.tanh(v / 0.01)
+    tau = times * INERTIA * a + WEIGHT * np.sin(q - zero) + 0.2 * v + 0.3 * np.tanh(v / 0.01)
     tau = tau + 0.03 * rng.normal(size=len(time))
     return jaxid.Recording.from_arrays(time / faster, q[:, None], tau[:, None], name=f"run{seed}")
 
@@ -166,3 +169,16 @@ def test_bodies_much_lighter_than_drawn_are_doubtful(faster, times, share):
     )
     assert float(said.group(1)) == pytest.approx(share, rel=0.05)
     assert "clock" in found.mistake
+
+
+@pytest.mark.parametrize("zero", [0.0, 0.3, 1.5])
+def test_another_zero_position_contradicts_the_drawn_bodies(zero):
+    runs = [swung(seed, zero=zero) for seed in (1, 2)]
+    found = jaxid.fit(jaxid.serial(PENDULUM, bodies="free"), runs, jaxid.OEM(progress=False))
+    assert found.error_percent.to_numpy().max() < 3
+    assert ("zero positions" in found.mistake) == (zero > 1)
+    if not zero > 1:
+        return
+    story = jaxid.discover(jaxid.serial(PENDULUM, bodies="free"), runs, progress=False)
+    assert story.verdict == "undetermined"
+    assert "start from the estimated bodies" in story.reason

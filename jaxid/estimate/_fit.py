@@ -17,7 +17,8 @@ from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
 from ..simulation.batch import at_rest, check_joints, check_law
 from ..simulation.loop import ClosedLoop
-from .mistakes import LARGE_PERCENT, lighter_than_drawn, likely_mistake
+from .drawn import contradiction
+from .mistakes import LARGE_PERCENT, likely_mistake
 from .oem import OEM, oem_of
 from .result import DOUBTFUL_PERCENT, AbstractMethod, Fit, Status
 from .standstill import raised, slow_note
@@ -184,7 +185,7 @@ def _examined(found: Fit, loop: ClosedLoop) -> Fit:
         return found
     largest = float((found.error_percent * _of_motion(found)).to_numpy().max())
     mistake = likely_mistake(loop, found.recordings) if largest > LARGE_PERCENT else ""
-    mistake = mistake or lighter_than_drawn(found)
+    mistake = mistake or contradiction(found)
     notes = (mistake, *found.notes) if mistake else found.notes
     return dataclasses.replace(found, mistake=mistake, notes=notes)
 

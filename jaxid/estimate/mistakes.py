@@ -1,4 +1,4 @@
-"""Possible mistakes in the recordings of a fit, each tested in turn."""
+"""Possible mistakes in the recordings of a fit that explains little, each tested in turn."""
 
 import dataclasses
 import itertools
@@ -8,16 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..arms import SerialArm
 from ..effects import RotorInertia
 from ..errors import JaxidError
 from ..parameters import Bounds, Parameter, write_values
 from ..recording import Recording, Recordings
-from ..simulation.inertia import mass_matrices
 from ..simulation.loop import ClosedLoop
 from .idim import stack
 from .regression import Filtering, decimator, filtered, linear_parameters
-from .result import Fit
 
 # Relative error, %, above which a mistake is looked for.
 LARGE_PERCENT = 10.0
@@ -28,9 +25,6 @@ _SHARE, _GOOD = 0.25, 20.0
 _OFTEN = 0.05
 # Weight of the coefficients of columns of unit length in the regressions.
 _RIDGE = 1e-3
-# Share of the inertia of drawn bodies below which estimated ones are doubtful, and the smallest
-# significant difference, in standard deviations.
-_LIGHT, _SURE = 0.5, 3.0
 # Range of a long recording of white noise, in standard deviations.
 _STILL = 12.0
 # Factors between units that are often confused.
@@ -77,57 +71,6 @@ def likely_mistake(loop: ClosedLoop, recordings: Recordings) -> str:
         f"{said}: with this corrected, the error of a regression is {np.sqrt(size):.2g} % instead "
         f"of {np.sqrt(np.mean(before**2)):.3g} %"
     )
-
-
-def lighter_than_drawn(found: Fit) -> str:
-    """The mistake if estimated bodies have much less inertia than the drawn ones, or empty.
-
-    A clock that is twice as fast, or a torque in a wrong unit, does not raise the error if bodies
-    are estimated: both only scale parameters. Inertia above that of the drawn bodies may be that of
-    rotors, inertia below half of it on every joint is neither theirs nor a usual error of a
-    drawing.
-    """
-    arm = found.loop.arm
-    if not isinstance(arm, SerialArm) or not found.succeeded:
-        return ""
-    q = np.concatenate([r.q for r in found.recordings])
-    drawn = _inertia(dataclasses.replace(arm, base=None), q)
-    rotors = np.zeros(arm.joints)
-    for effect in found.loop.effects:
-        if isinstance(effect, RotorInertia):
-            rotors[effect.joint - 1] += float(effect.inertia)
-    share = (_inertia(arm, q) + rotors) / drawn
-    if not np.all(share < _LIGHT):
-        return ""
-    spread = _spread(found, arm, q) / drawn
-    if not np.all(share + _SURE * spread < _LIGHT):
-        return ""
-    said = " and ".join(f"{x:.2g}" for x in share)
-    return (
-        f"the estimated inertia is {said} of that of the bodies in "
-        "the file: check the clock of the time stamps (one that is twice as fast gives a quarter), "
-        "the unit of torque and torque constants; if the file is wrong instead, start from the "
-        "estimated bodies (jaxid.write_urdf)"
-    )
-
-
-def _inertia(arm: SerialArm, q: Float[np.ndarray, "samples joints"]) -> np.ndarray:
-    """Inertia of each joint while the others are at rest, averaged over positions."""
-    return np.diagonal(mass_matrices(arm, q), axis1=1, axis2=2).mean(axis=0)
-
-
-def _spread(found: Fit, arm: SerialArm, q: Float[np.ndarray, "samples joints"]) -> np.ndarray:
-    """Standard deviation of each joint's inertia due to that of the base parameters."""
-    names = [n for p in found.loop.free_parameters if p.place == ("arm", "base") for n in p.names]
-    at = [found.names.index(name) for name in names]
-    covariance = found.covariance[np.ix_(at, at)]
-    base = np.asarray(arm.base)
-    if len(at) != len(base) or not np.isfinite(covariance).all():
-        return np.full(arm.joints, np.inf)
-    # Inertia is linear in the base parameters.
-    moved = [_inertia(dataclasses.replace(arm, base=base + row), q) for row in np.eye(len(base))]
-    slopes = np.stack(moved) - _inertia(arm, q)
-    return np.sqrt(np.einsum("aj,ab,bj->j", slopes, covariance, slopes))
 
 
 def at_limit(recordings: Recordings) -> str:

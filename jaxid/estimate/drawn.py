@@ -1,0 +1,162 @@
+"""Mistakes that raise no error if bodies are estimated: they contradict the drawn bodies.
+
+A clock that is twice as fast, torque in a wrong unit, another zero position and sometimes another
+robot change the estimated bodies only. Drawings have errors, but rotors and a tool that a file
+lacks only add to its bodies. So bodies that seem much lighter on every joint are called a mistake.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..arms import SerialArm
+from ..effects import RotorInertia
+from ..errors import JaxidError
+from ..simulation.inertia import mass_matrices
+from .idim import stack
+from .regression import Filtering, decimator, filtered, linear_parameters
+from .result import Fit
+
+# Share of drawn inertia, or of the torque of drawn bodies, below which the estimate is doubtful.
+_LIGHT = 0.5
+# Smallest torque of drawn bodies that is compared, as a share of the recorded torque.
+_VISIBLE = 0.1
+# Smallest significant difference, in standard deviations.
+_SURE = 3.0
+
+
+class _Bodies(eqx.Module):
+    """A serial arm with its estimated base parameters, and with the drawn ones."""
+
+    arm: SerialArm
+    drawn: SerialArm
+    covariance: Float[np.ndarray, "base base"]
+
+
+def contradiction(found: Fit) -> str:
+    """The mistake if estimated bodies contradict those of the file, as a sentence; or empty."""
+    bodies = _bodies_of(found)
+    if bodies is None:
+        return ""
+    if (share := _inertias(found, bodies)) is not None:
+        return (
+            f"the estimated inertia is {_listed(share)} of that of the bodies in the file: check "
+            "the clock of the time stamps (one that is twice as fast gives a quarter), the unit of "
+            f"torque and torque constants; {_OTHERWISE}"
+        )
+    if (share := _torques(found, bodies)) is not None:
+        return (
+            f"the torque of the estimated bodies is {_listed(share)} of that of the bodies in the "
+            "file: check that the file describes this robot, the order of its joints and their "
+            f"zero positions; {_OTHERWISE}"
+        )
+    return ""
+
+
+_OTHERWISE = "if the file is wrong instead, start from the estimated bodies (jaxid.write_urdf)"
+
+
+def _listed(values: Float[np.ndarray, " joints"]) -> str:
+    return " and ".join(f"{x:.2g}" for x in values)
+
+
+def _bodies_of(found: Fit) -> _Bodies | None:
+    """The bodies of a fit; None if it has not estimated all of their base parameters."""
+    arm = found.loop.arm
+    if not isinstance(arm, SerialArm) or not found.succeeded:
+        return None
+    names = [n for p in found.loop.free_parameters if p.place == ("arm", "base") for n in p.names]
+    at = [found.names.index(name) for name in names]
+    covariance = found.covariance[np.ix_(at, at)]
+    if len(at) < len(arm.base) or not np.isfinite(covariance).all():
+        return None
+    return _Bodies(arm, dataclasses.replace(arm, base=None), covariance)
+
+
+def _inertias(found: Fit, bodies: _Bodies) -> Float[np.ndarray, " joints"] | None:
+    """Shares of the drawn inertia if they are too small on all joints; otherwise None."""
+    q = np.concatenate([r.q for r in found.recordings])
+    rotors = np.zeros(bodies.arm.joints)
+    for effect in found.loop.effects:
+        if isinstance(effect, RotorInertia):
+            rotors[effect.joint - 1] += float(effect.inertia)
+    drawn, own = _inertia(bodies.drawn, q), _inertia(bodies.arm, q)
+    share = (own + rotors) / drawn
+    if not np.all(share < _LIGHT):
+        return None
+    # Inertia is linear in the base parameters.
+    base = np.asarray(bodies.arm.base)
+    moved = [dataclasses.replace(bodies.arm, base=base + row) for row in np.eye(len(base))]
+    slopes = np.stack([_inertia(arm, q) for arm in moved]) - own
+    spread = np.sqrt(np.einsum("aj,ab,bj->j", slopes, bodies.covariance, slopes)) / drawn
+    return share if np.all(share + _SURE * spread < _LIGHT) else None
+
+
+def _inertia(
+    arm: SerialArm, q: Float[np.ndarray, "samples joints"]
+) -> Float[np.ndarray, " joints"]:
+    """Inertia of each joint while the others are at rest, averaged over positions."""
+    return np.diagonal(mass_matrices(arm, q), axis1=1, axis2=2).mean(axis=0)
+
+
+def _torques(found: Fit, bodies: _Bodies) -> Float[np.ndarray, " joints"] | None:
+    """Shares of the torque of drawn bodies if they are too small on all joints; otherwise None.
+
+    The share is the coefficient of the drawn bodies' torque in a regression of the estimated
+    bodies' torque, with the acceleration for a rotor, and a constant for an offset. Joints whose
+    drawn torque apart from these two is small have no share (NaN).
+    """
+    filtering, runs = Filtering(), found.recordings
+    try:
+        motions = [filtered(r, filtering.on(r)) for r in runs]
+        columns = stack(found.loop, runs, filtering, motions).columns
+        reduce = [decimator(r, filtering.on(r)) for r in runs]
+    except JaxidError:
+        return None
+    chosen = linear_parameters(found.loop)
+    own = np.repeat([p.place == ("arm", "base") for p in chosen], [p.size for p in chosen])
+    a, tau = (
+        np.concatenate(
+            [to(np.asarray(getattr(m, x))) for to, m in zip(reduce, motions, strict=True)]
+        )
+        for x in ("a", "tau")
+    )
+    drawn, estimated = np.asarray(bodies.drawn.base), np.asarray(bodies.arm.base)
+    share, high = np.full((2, bodies.arm.joints), np.nan)
+    for j in range(bodies.arm.joints):
+        mine = columns[:, j][:, own]
+        weight = _weight(mine @ drawn, mine @ estimated, a[:, j], np.linalg.norm(tau[:, j]))
+        if weight is not None:
+            slope = weight @ mine
+            share[j] = slope @ estimated
+            high[j] = share[j] + _SURE * np.sqrt(slope @ bodies.covariance @ slope)
+    tested = np.isfinite(share)
+    return share[tested] if tested.any() and np.all(high[tested] < _LIGHT) else None
+
+
+def _weight(
+    expected: Float[np.ndarray, " samples"],
+    estimated: Float[np.ndarray, " samples"],
+    a: Float[np.ndarray, " samples"],
+    size: float,
+) -> Float[np.ndarray, " samples"] | None:
+    """Weights of samples whose sum is a coefficient of a regression; None if it is not determined.
+
+    **Arguments:**
+
+    - `expected`, `estimated`: torque of drawn and of estimated bodies on a joint.
+    - `a`: its acceleration. `size`: norm of its recorded torque.
+    """
+    for others in (np.stack([a, np.ones_like(a)], axis=1), np.ones((len(a), 1))):
+        basis = np.linalg.qr(others)[0]
+        rest = expected - basis @ (basis.T @ expected)
+        if not np.linalg.norm(rest) > _VISIBLE * size:
+            return None
+        weight = rest / (rest @ rest)
+        left = estimated - (weight @ estimated) * expected
+        # A rotor has no negative inertia.
+        if others.shape[1] == 1 or np.linalg.lstsq(others, left)[0][0] >= 0:
+            return weight
+    return None
