@@ -1,9 +1,10 @@
 """Long computations that are killed, interrupted, or large.
 
-python -m benchmarks.reliability [--part kills|interrupts|size] [--quick] [--json FILE]
+python -m benchmarks.reliability [--part kills|discoveries|interrupts|size] [--quick] [--json FILE]
 
 kills: bootstrap draws of a regression as a campaign, ended by SIGKILL at 50 random moments and
-restarted each time; the result must be bit-identical to an undisturbed run. interrupts: Ctrl-C at
+restarted each time; the result must be bit-identical to an undisturbed run. discoveries: the same
+for `jaxid discover --resume` with 20 kills, and runs on one core and on all. interrupts: Ctrl-C at
 random moments of `jaxid fit`, and the time until the process ends. size: 1024 recordings of 20 s in
 one fit, and 10 000 bootstrap draws by its Jacobian; peak memory and time.
 """
@@ -31,7 +32,7 @@ import jaxid
 from jaxid.storage.campaign import Campaign
 from tests import independent as sim
 
-PARTS = ("kills", "interrupts", "size")
+PARTS = ("kills", "discoveries", "interrupts", "size")
 DEMO = Path(jaxid.__file__).parent / "demo" / "hidden"
 
 
@@ -123,6 +124,72 @@ def kills(quick: bool) -> dict[str, Any]:
         "pieces_at_the_end": [len(list(one.glob("*.piece"))) for one in folders],
         "same_to_the_bit": digests == {undisturbed},
     }
+
+
+# --- discoveries ----------------------------------------------------------------------------------
+
+
+def discoveries(quick: bool) -> dict[str, Any]:
+    """Ends `jaxid discover` at random moments, resumes it, and compares the results."""
+    seed = secrets.randbits(31)
+    moments = random.Random(seed)
+    folder = Path(tempfile.mkdtemp(prefix="reliability_"))
+    _discovered(folder / "first")
+    started = time.perf_counter()
+    undisturbed = _discovered(folder / "second")
+    took = time.perf_counter() - started
+    same, times = 0, 1 if quick else 20
+    for k in range(times):
+        _discovered(folder / f"killed {k}", moments.uniform(1.5, 0.95 * took))
+        same += _discovered(folder / f"killed {k}") == undisturbed
+    alone = _discovered(folder / "one core", cores={min(os.sched_getaffinity(0))})
+    assert alone is not None
+    assert undisturbed is not None
+    scores = [np.array([m["score"] for m in x["models"]]) for x in (alone, undisturbed)]
+    return {
+        "seed": seed,
+        "killed": times,
+        "same_to_the_bit": same,
+        "same_models_on_one_core": [m["model"] for m in alone["models"]]
+        == [m["model"] for m in undisturbed["models"]],
+        "largest_difference_of_scores": float(np.abs(scores[0] - scores[1]).max()),
+    }
+
+
+def _discovered(
+    steps: Path, kill_after: float | None = None, cores: set[int] | None = None
+) -> dict[str, Any] | None:
+    """The result of `jaxid discover` without its durations; None if it is killed.
+
+    **Arguments:**
+
+    - `steps`: folder of saved steps. `kill_after`: s. `cores`: all if None.
+    """
+    out = steps.with_suffix(".json")
+    command = [sys.executable, "-c", "from jaxid.cli import main; main()", "discover", "--quiet"]
+    command += [str(DEMO / f"fit_{k}.csv") for k in (1, 2)]
+    command += ["--validate", str(DEMO / "held_out.csv"), "--robot", "scara"]
+    command += ["--resume", str(steps), "--json", str(out)]
+    pinned = os.sched_getaffinity(0) if cores is None else cores
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: os.sched_setaffinity(0, pinned),
+    )
+    try:
+        process.communicate(timeout=kill_after)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+        return None
+    return _without_seconds(json.loads(out.read_text(encoding="utf-8")))
+
+
+def _without_seconds(found: Any) -> Any:
+    if isinstance(found, dict):
+        return {k: _without_seconds(x) for k, x in found.items() if "seconds" not in k}
+    return [_without_seconds(x) for x in found] if isinstance(found, list) else found
 
 
 # --- interrupted ----------------------------------------------------------------------------------
@@ -239,7 +306,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a smaller run of the same kind")
     parser.add_argument("--json", type=Path, help="also write the numbers to this file")
     given = parser.parse_args()
-    works = {"kills": kills, "interrupts": interrupts, "size": size}
+    works = {"kills": kills, "discoveries": discoveries, "interrupts": interrupts, "size": size}
     results = {}
     for part in given.part or PARTS:
         results[part] = works[part](given.quick)

@@ -49,8 +49,8 @@ def contradiction(found: Fit) -> str:
     if (share := _torques(found, bodies)) is not None:
         return (
             f"the torque of the estimated bodies is {_listed(share)} of that of the bodies in the "
-            "file: check that the file describes this robot, the order of its joints and their "
-            f"zero positions; {_OTHERWISE}"
+            "file: check the units and zero positions of the joints, their order, and that the "
+            f"file describes this robot; {_OTHERWISE}"
         )
     return ""
 
