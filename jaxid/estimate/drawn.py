@@ -15,8 +15,8 @@ from ..arms import SerialArm
 from ..effects import RotorInertia
 from ..errors import JaxidError
 from ..simulation.inertia import mass_matrices
-from .idim import stack
-from .regression import Filtering, decimator, filtered, linear_parameters
+from .idim import stack_with_motion
+from .regression import linear_parameters
 from .result import Fit
 
 # Share of drawn inertia, or of the torque of drawn bodies, below which the estimate is doubtful.
@@ -108,26 +108,18 @@ def _torques(found: Fit, bodies: _Bodies) -> Float[np.ndarray, " joints"] | None
     bodies' torque, with the acceleration for a rotor, and a constant for an offset. Joints whose
     drawn torque apart from these two is small have no share (NaN).
     """
-    filtering, runs = Filtering(), found.recordings
     try:
-        motions = [filtered(r, filtering.on(r)) for r in runs]
-        columns = stack(found.loop, runs, filtering, motions).columns
-        reduce = [decimator(r, filtering.on(r)) for r in runs]
+        stacked, rows = stack_with_motion(found.loop, found.recordings)
     except JaxidError:
         return None
     chosen = linear_parameters(found.loop)
     own = np.repeat([p.place == ("arm", "base") for p in chosen], [p.size for p in chosen])
-    a, tau = (
-        np.concatenate(
-            [to(np.asarray(getattr(m, x))) for to, m in zip(reduce, motions, strict=True)]
-        )
-        for x in ("a", "tau")
-    )
     drawn, estimated = np.asarray(bodies.drawn.base), np.asarray(bodies.arm.base)
     share, high = np.full((2, bodies.arm.joints), np.nan)
     for j in range(bodies.arm.joints):
-        mine = columns[:, j][:, own]
-        weight = _weight(mine @ drawn, mine @ estimated, a[:, j], np.linalg.norm(tau[:, j]))
+        mine = stacked.columns[:, j][:, own]
+        size = float(np.linalg.norm(rows["tau"][:, j]))
+        weight = _weight(mine @ drawn, mine @ estimated, rows["a"][:, j], size)
         if weight is not None:
             slope = weight @ mine
             share[j] = slope @ estimated

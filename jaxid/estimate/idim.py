@@ -63,6 +63,26 @@ def stack(loop: ClosedLoop, recordings: Recordings, filtering: Filtering, motion
     return Stacked(np.concatenate(columns), np.concatenate(rights), scales, lengths)
 
 
+def stack_with_motion(
+    loop: ClosedLoop, recordings: Recordings
+) -> tuple[Stacked, dict[str, Float[np.ndarray, "samples joints"]]]:
+    """The regression along the filtered motion, with q, a and the recorded tau of its rows.
+
+    **Raises:** `FitError` if a recording cannot be filtered.
+    """
+    filtering = Filtering()
+    settled = [filtering.on(r) for r in recordings]
+    motions = [filtered(r, own) for r, own in zip(recordings, settled, strict=True)]
+    reduce = [decimator(r, own) for r, own in zip(recordings, settled, strict=True)]
+    rows = {
+        name: np.concatenate(
+            [to(np.asarray(getattr(m, name))) for to, m in zip(reduce, motions, strict=True)]
+        )
+        for name in ("q", "a", "tau")
+    }
+    return stack(loop, recordings, filtering, motions), rows
+
+
 class Solved(eqx.Module):
     """A solved regression."""
 

@@ -13,8 +13,8 @@ from ..errors import JaxidError
 from ..parameters import Bounds, Parameter, write_values
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
-from .idim import stack
-from .regression import Filtering, decimator, filtered, linear_parameters
+from .idim import stack_with_motion
+from .regression import linear_parameters
 
 # Relative error, %, above which a mistake is looked for.
 LARGE_PERCENT = 10.0
@@ -101,22 +101,14 @@ def _left(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " joint
     """Relative error of each joint's torque in a bounded regression, %; None if it fails."""
     import scipy
 
-    filtering = Filtering()
     try:
-        settled = [filtering.on(r) for r in recordings]
-        motions = [filtered(r, own) for r, own in zip(recordings, settled, strict=True)]
-        stacked = stack(loop, recordings, filtering, motions)
+        stacked, rows = stack_with_motion(loop, recordings)
         chosen = linear_parameters(loop)
     except JaxidError:
         return None
-    reduce = [decimator(r, own) for r, own in zip(recordings, settled, strict=True)]
-    q, tau = (
-        np.concatenate([to(getattr(m, x)) for to, m in zip(reduce, motions, strict=True)])
-        for x in ("q", "tau")
-    )
-    wide = np.concatenate([stacked.columns, _of_position(q)], axis=-1)
+    wide = np.concatenate([stacked.columns, _of_position(rows["q"])], axis=-1)
     # Relative to the recorded torque; the right-hand side is without that of held bodies.
-    size = np.maximum(np.linalg.norm(tau, axis=0), 1e-300)
+    size = np.maximum(np.linalg.norm(rows["tau"], axis=0), 1e-300)
     columns = (wide / size[:, None]).reshape(-1, wide.shape[-1])
     right = (stacked.right / size).ravel()
     length = np.linalg.norm(columns, axis=0)
