@@ -14,7 +14,7 @@ from jaxid.discovery.models import Model
 from jaxid.discovery.remarks import looks_sampled
 from jaxid.discovery.verdict import _power, _spread, _through, on_unseen, refuted, undecided
 from jaxid.discovery.verify import Refits
-from jaxid.effects import AsymmetricFriction, Spring, TimeDelay, TorqueOffset, TorqueRipple
+from jaxid.effects import Spring, TimeDelay, TorqueOffset, TorqueRipple
 from jaxid.noise import ARFilter
 from jaxid.report._head import values
 
@@ -135,23 +135,6 @@ def test_a_further_effect_that_is_probable_is_undecided(offset_story):
     assert undecided([dataclasses.replace(more, fit=None), chosen, start], chosen, {}) == ""
     worse = dataclasses.replace(more, score=-49.0)
     assert undecided([chosen, worse, start], chosen, {}) == ""
-
-
-def test_friction_in_the_place_of_an_offset_is_no_further_effect(offset_story):
-    fit, friction = offset_story[0].fit, AsymmetricFriction(joint=2)
-    (offset,) = (p for p in fit.loop.free_parameters if p.name == "offset2")
-    without = dataclasses.replace(fit, loop=fit.loop.hold(**{offset.name: 0.0}))
-    start = Model((), 0.0, fit=fit, weight=0.2)
-    instead = Model((friction,), -2.8, fit=without, weight=0.8)
-    assert undecided([instead, start], start, {}) == ""
-    beside = dataclasses.replace(instead, fit=fit)
-    assert "a probability of only 0.2" in undecided([beside, start], start, {})
-    # The same beside an effect that was added.
-    chosen = Model((Spring(joint=1),), -50.0, fit=fit)
-    both = dataclasses.replace(instead, effects=(*chosen.effects, friction), score=-53.0)
-    assert undecided([both, chosen, start], chosen, {}) == ""
-    again = dataclasses.replace(both, fit=fit)
-    assert "asymmetric_friction on joint 2" in undecided([again, chosen, start], chosen, {})
 
 
 def test_a_start_that_shares_the_weight_is_undecided():

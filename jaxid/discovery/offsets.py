@@ -73,11 +73,6 @@ def instead_of_offsets(predictor: Predictor, std: Float[np.ndarray, " values"]) 
     return sorted(found, key=lambda x: x.loss)
 
 
-def replaces_offset(loop: ClosedLoop, other: ClosedLoop) -> bool:
-    """Whether a loop has no offset where another one estimates it."""
-    return bool({*held_offsets(loop)} - {*held_offsets(other)})
-
-
 def held_offsets(loop: ClosedLoop) -> list[str]:
     """Names of the offsets of a loop that are not estimated."""
     return [

@@ -18,7 +18,6 @@ from .floor import SPOKEN, Floor, floor_of
 from .hypotheses import effect_on
 from .likelihood import weights
 from .models import LIKELY, Model, Named, probability
-from .offsets import replaces_offset
 from .relevance import REFUTED, allowed
 from .score import spanned
 from .step import OnUnseen
@@ -65,13 +64,11 @@ def undecided(
     """
     start = next(m for m in models if not m.effects and m.curve is None)
     if not chosen.effects:
-        # An offset that may also be friction by direction is a note, not a missing effect.
-        weight = start.weight + sum(m.weight for m in models if _has_no_more(m, start))
-        if weight >= _HALF:
+        if start.weight >= _HALF:
             return ""
-        rival = next(m for m in models if m is not start and not _has_no_more(m, start))
+        rival = next(m for m in models if m is not start)
         return (
-            f"the starting model has a probability of only {weight:.2g}, and "
+            f"the starting model has a probability of only {start.weight:.2g}, and "
             f"{rival.label} has {rival.weight:.2g}: record more, or longer"
         )
     if chosen.score < start.score - LIKELY:
@@ -99,18 +96,10 @@ def _improbable(
     return ""
 
 
-def _has_no_more(model: Model, chosen: Model) -> bool:
-    """Whether a model has friction by direction in place of an offset, and no further effect."""
-    if model.fit is None or chosen.fit is None or len(model.effects) != len(chosen.effects) + 1:
-        return False
-    return replaces_offset(model.fit.loop, chosen.fit.loop)
-
-
 def _incomplete(models: Sequence[Model], chosen: Model) -> str:
     """The reason if a further effect is probable, although not by odds of 20 to 1."""
     mine = Counter(chosen.key)
-    fitted = [m for m in models if m.fit is not None and m.curve is None]
-    more = [m for m in fitted if mine < Counter(m.key) and not _has_no_more(m, chosen)]
+    more = [m for m in models if m.fit is not None and m.curve is None and mine < Counter(m.key)]
     best = min(more, key=lambda m: m.score, default=chosen)
     share = 1.0 - float(weights([m.score for m in (chosen, *more)])[0])
     if share < _HALF:

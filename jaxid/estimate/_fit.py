@@ -184,7 +184,7 @@ def _examined(found: Fit, loop: ClosedLoop) -> Fit:
     if oem_of(found).start == "given":
         return found
     largest = float((found.error_percent * _of_motion(found)).to_numpy().max())
-    mistake = likely_mistake(loop, found.recordings) if largest > LARGE_PERCENT else ""
+    mistake = "" if largest < LARGE_PERCENT else likely_mistake(loop, found.recordings)
     mistake = mistake or contradiction(found)
     notes = (mistake, *found.notes) if mistake else found.notes
     return dataclasses.replace(found, mistake=mistake, notes=notes)

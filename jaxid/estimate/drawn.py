@@ -25,6 +25,7 @@ _LIGHT = 0.5
 _VISIBLE = 0.1
 # Smallest significant difference, in standard deviations.
 _SURE = 3.0
+_OTHERWISE = "if the file is wrong instead, start from the estimated bodies (jaxid.write_urdf)"
 
 
 class _Bodies(eqx.Module):
@@ -53,9 +54,6 @@ def contradiction(found: Fit) -> str:
             f"file describes this robot; {_OTHERWISE}"
         )
     return ""
-
-
-_OTHERWISE = "if the file is wrong instead, start from the estimated bodies (jaxid.write_urdf)"
 
 
 def _listed(values: Float[np.ndarray, " joints"]) -> str:
@@ -106,7 +104,7 @@ def _torques(found: Fit, bodies: _Bodies) -> Float[np.ndarray, " joints"] | None
 
     The share is the coefficient of the drawn bodies' torque in a regression of the estimated
     bodies' torque, with the acceleration for a rotor, and a constant for an offset. Joints whose
-    drawn torque apart from these two is small have no share (NaN).
+    drawn torque apart from these two is small are left out.
     """
     try:
         stacked, rows = stack_with_motion(found.loop, found.recordings)
@@ -134,12 +132,14 @@ def _weight(
     a: Float[np.ndarray, " samples"],
     size: float,
 ) -> Float[np.ndarray, " samples"] | None:
-    """Weights of samples whose sum is a coefficient of a regression; None if it is not determined.
+    """Weights of samples, 1/(N·m) or 1/N, for the coefficient of the expected torque in another.
+
+    None if the expected torque is too small.
 
     **Arguments:**
 
-    - `expected`, `estimated`: torque of drawn and of estimated bodies on a joint.
-    - `a`: its acceleration. `size`: norm of its recorded torque.
+    - `expected`, `estimated`: torque of drawn and of estimated bodies on a joint, N·m or N.
+    - `a`: its acceleration, rad/s² or m/s². `size`: norm of its recorded torque, N·m or N.
     """
     for others in (np.stack([a, np.ones_like(a)], axis=1), np.ones((len(a), 1))):
         basis = np.linalg.qr(others)[0]
