@@ -84,6 +84,7 @@ MISTAKES: dict[str, tuple[Mistake, tuple[str, ...]]] = {
     "another robot": (_same, ("robot", "check")),
     "drive at its limit": (_limited, ("limit", "saturat")),
 }
+_TWO_JOINTS = ("planar", "scara", "gantry", "polar")
 
 
 def broken(case: Case, name: str, joint: int) -> Case:
@@ -98,15 +99,15 @@ def run_case(seed: int, number: int, name: str, bodies: str) -> dict[str, Any]:
 
     **Arguments:**
 
-    - `number`: determines robot and joint. `name`: name of the error.
+    - `number`: determines robot and joint, with the seed. `name`: name of the error.
     - `bodies`: "free" or "drawn".
     """
-    robots = ("planar", "scara", "gantry", "polar") if name != "torques swapped" else ("planar",)
-    robot = robots[number % len(robots)]
+    rng = np.random.default_rng([seed, number])
+    robot = str(rng.choice(_TWO_JOINTS))
+    joint = int(rng.integers(2))
     wanted = draw_wanted(seed + number, 1, ("unknown",), robot)[0]
     wanted = dataclasses.replace(wanted, kind="clean", effects=())
     case = make(wanted)
-    joint = number % 2
     loop = start_model(case, "unknown")
     if name == "another robot":
         other = dataclasses.replace(wanted, robot="gantry" if robot != "gantry" else "planar")
@@ -126,6 +127,7 @@ def run_case(seed: int, number: int, name: str, bodies: str) -> dict[str, Any]:
     return {
         "mistake": name,
         "robot": robot,
+        "joint": joint + 1,
         "verdict": verdict,
         "sure": verdict in ("adequate", "explained"),
         "named": any(word in said for word in MISTAKES[name][1]),

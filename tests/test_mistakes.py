@@ -107,6 +107,16 @@ def test_a_torque_that_is_often_at_its_largest_value_is_named(clean):
     assert re.fullmatch("the torque of joint 2 is at its .* may be at its limit", at_limit(limited))
 
 
+def test_a_limited_torque_that_the_motion_does_not_explain_is_a_mistake(clean):
+    """The motion is that of the torque before the limit."""
+    unknown = dataclasses.replace(jaxid.scara(), controller=jaxid.control.Tracking())
+    for share, is_named in ((0.05, True), (0.8, False)):
+        top = [share * max(np.abs(r.tau[:, j]).max() for r in clean) for j in range(2)]
+        limited = spoilt(clean, lambda r, top=top: {"tau": np.clip(r.tau, -np.array(top), top)})
+        found = jaxid.fit(unknown, limited, jaxid.OEM(progress=False))
+        assert ("is at its largest value in" in found.mistake) == is_named
+
+
 def test_a_fit_names_the_mistake_first(clean):
     change, said = MISTAKES["swapped"]
     unknown = dataclasses.replace(jaxid.scara(), controller=jaxid.control.Tracking())

@@ -18,7 +18,7 @@ from ..recording import Recording, Recordings, missing_after
 from ..simulation.batch import at_rest, check_joints, check_law
 from ..simulation.loop import ClosedLoop
 from .drawn import contradiction
-from .mistakes import LARGE_PERCENT, likely_mistake
+from .mistakes import LARGE_PERCENT, at_limit, likely_mistake
 from .oem import OEM, oem_of
 from .result import DOUBTFUL_PERCENT, AbstractMethod, Fit, Status
 from .standstill import raised, slow_note
@@ -185,9 +185,26 @@ def _examined(found: Fit, loop: ClosedLoop) -> Fit:
         return found
     largest = float((found.error_percent * _of_motion(found)).to_numpy().max())
     mistake = "" if largest < LARGE_PERCENT else likely_mistake(loop, found.recordings)
-    mistake = mistake or contradiction(found)
+    mistake = mistake or contradiction(found) or _limited(found)
     notes = (mistake, *found.notes) if mistake else found.notes
     return dataclasses.replace(found, mistake=mistake, notes=notes)
+
+
+def _limited(found: Fit) -> str:
+    """A sentence if the motion does not explain the torque of a joint that is often at its limit.
+
+    Only if the motion is known, because a simulated motion may differ where a drive is limited.
+    """
+    if not found.loop.controller.imposes:
+        return ""
+    errors = found.error_percent.to_numpy().max(axis=0)
+    said = at_limit(found.recordings, np.flatnonzero(errors > DOUBTFUL_PERCENT).tolist())
+    if not said:
+        return ""
+    return (
+        f"{said}, and the motion does not explain it (error {errors.max():.3g} %): cut out these "
+        "stretches, or record a slower motion"
+    )
 
 
 def _doubted(found: Fit) -> Fit:

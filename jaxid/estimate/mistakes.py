@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -73,10 +73,15 @@ def likely_mistake(loop: ClosedLoop, recordings: Recordings) -> str:
     )
 
 
-def at_limit(recordings: Recordings) -> str:
+def at_limit(recordings: Recordings, joints: Sequence[int] | None = None) -> str:
     """The joints whose torque often has one largest value, as a sentence; empty if there are none.
 
-    It is no mistake, because a limited drive can be part of the model.
+    It is a mistake only if the model does not describe this torque, because a limited drive can be
+    part of the model.
+
+    **Arguments:**
+
+    - `joints`: the joints to test, from 0; by default all.
     """
     tau = np.concatenate([np.abs(r.tau) for r in recordings])
     share = np.mean(tau >= (1 - 1e-9) * tau.max(axis=0), axis=0)
@@ -84,6 +89,7 @@ def at_limit(recordings: Recordings) -> str:
         f"the torque of joint {j + 1} is at its largest value in {100 * share[j]:.0f} % of the "
         "samples, so its drive may be at its limit"
         for j in np.flatnonzero(share > _OFTEN)
+        if joints is None or j in joints
     ]
     return " and ".join(said)
 
