@@ -192,3 +192,35 @@ def test_another_zero_position_contradicts_the_drawn_bodies(zero):
     story = jaxid.discover(jaxid.serial(PENDULUM, bodies="free"), runs, progress=False)
     assert story.verdict == "undetermined"
     assert "start from the estimated bodies" in story.reason
+
+
+GANTRY = """<robot name="gantry"><link name="base"/><link name="bridge"><inertial>
+<mass value="5.0"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="cart"><inertial>
+<mass value="2.0"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="along" type="prismatic"><parent link="base"/><child link="bridge"/>
+<axis xyz="1 0 0"/><limit lower="-2" upper="2" effort="900" velocity="9"/></joint>
+<joint name="across" type="prismatic"><parent link="bridge"/><child link="cart"/>
+<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="900" velocity="9"/></joint></robot>"""
+
+
+def slid(seed: int, units: tuple[float, float]) -> jaxid.Recording:
+    """A gantry moved by sines; its positions are multiplied by `units`."""
+    rng = np.random.default_rng(seed)
+    time, rates = np.arange(0.0, 10.0, 0.005), np.array([2.0, 5.1])
+    phases = rng.uniform(0, 6, (2, 2))
+    q, v, a = (
+        np.sum(0.3 * rates**k * np.sin(rates * time[:, None, None] + phases + k * np.pi / 2), -1)
+        for k in range(3)
+    )
+    tau = a * [7.0, 2.0] + 3.0 * v + np.tanh(v / 0.01) + 0.1 * rng.normal(size=q.shape)
+    return jaxid.Recording.from_arrays(time, q * units, tau, name=f"run{seed}")
+
+
+@pytest.mark.parametrize(("unit", "is_named"), [(1.0, False), (180 / np.pi, True)])
+def test_one_joint_in_a_wrong_unit_contradicts_the_drawn_bodies(unit, is_named):
+    """The mass of the cart alone moves the second joint, so it absorbs the unit."""
+    runs = [slid(seed, (1.0, unit)) for seed in (1, 2)]
+    found = jaxid.fit(jaxid.serial(GANTRY, bodies="free"), runs, jaxid.OEM(progress=False))
+    assert found.error_percent.to_numpy().max() < 4
+    assert ("check the unit of the position of joint 2 (" in found.mistake) == is_named

@@ -185,7 +185,7 @@ def _examined(found: Fit, loop: ClosedLoop) -> Fit:
         return found
     largest = float((found.error_percent * _of_motion(found)).to_numpy().max())
     mistake = "" if largest < LARGE_PERCENT else likely_mistake(loop, found.recordings)
-    mistake = mistake or contradiction(found) or _limited(found)
+    mistake = mistake or _limited(found) or contradiction(found)
     notes = (mistake, *found.notes) if mistake else found.notes
     return dataclasses.replace(found, mistake=mistake, notes=notes)
 

@@ -1,8 +1,9 @@
 """Mistakes that raise no error if bodies are estimated: they contradict the drawn bodies.
 
 A clock that is twice as fast, torque in a wrong unit, another zero position and sometimes another
-robot change the estimated bodies only. Drawings have errors, but rotors and a tool that a file
-lacks only add to its bodies. So bodies that seem much lighter on every joint are called a mistake.
+robot change the estimated bodies only, and so can a position in a wrong unit. Drawings have errors,
+but rotors and a tool that a file lacks only add to its bodies. So bodies that seem much lighter on
+every joint, or lighter by a factor between units on one joint, are called a mistake.
 """
 
 import dataclasses
@@ -21,6 +22,8 @@ from .result import Fit
 
 # Share of drawn inertia, or of the torque of drawn bodies, below which the estimate is doubtful.
 _LIGHT = 0.5
+# The same for one joint: an angle in degrees has 1/57 of the inertia, a distance in mm 1/1000.
+_UNIT = 1 / 20
 # Smallest torque of drawn bodies that is compared, as a share of the recorded torque.
 _VISIBLE = 0.1
 # Smallest significant difference, in standard deviations.
@@ -41,7 +44,15 @@ def contradiction(found: Fit) -> str:
     bodies = _bodies_of(found)
     if bodies is None:
         return ""
-    if (share := _inertias(found, bodies)) is not None:
+    share, high = _inertias(found, bodies)
+    if np.any(high < _UNIT):
+        joints = " and ".join(f"joint {j + 1}" for j in np.flatnonzero(high < _UNIT))
+        return (
+            f"the estimated inertia is {_listed(share)} of that of the bodies in the file: check "
+            f"the unit of the position of {joints} (degrees instead of rad give 0.017, mm instead "
+            f"of m 0.001), the clock and the unit of torque; {_OTHERWISE}"
+        )
+    if np.all(high < _LIGHT):
         return (
             f"the estimated inertia is {_listed(share)} of that of the bodies in the file: check "
             "the clock of the time stamps (one that is twice as fast gives a quarter), the unit of "
@@ -50,8 +61,8 @@ def contradiction(found: Fit) -> str:
     if (share := _torques(found, bodies)) is not None:
         return (
             f"the torque of the estimated bodies is {_listed(share)} of that of the bodies in the "
-            "file: check the units and zero positions of the joints, their order, and that the "
-            f"file describes this robot; {_OTHERWISE}"
+            "file: check the units and zero positions of the joints, their order, the clock of the "
+            f"time stamps, and that the file describes this robot; {_OTHERWISE}"
         )
     return ""
 
@@ -73,8 +84,10 @@ def _bodies_of(found: Fit) -> _Bodies | None:
     return _Bodies(arm, dataclasses.replace(arm, base=None), covariance)
 
 
-def _inertias(found: Fit, bodies: _Bodies) -> Float[np.ndarray, " joints"] | None:
-    """Shares of the drawn inertia if they are too small on all joints; otherwise None."""
+def _inertias(
+    found: Fit, bodies: _Bodies
+) -> tuple[Float[np.ndarray, " joints"], Float[np.ndarray, " joints"]]:
+    """Shares of the drawn inertia, and the largest ones that are not significantly too large."""
     q = np.concatenate([r.q for r in found.recordings])
     rotors = np.zeros(bodies.arm.joints)
     for effect in found.loop.effects:
@@ -82,14 +95,12 @@ def _inertias(found: Fit, bodies: _Bodies) -> Float[np.ndarray, " joints"] | Non
             rotors[effect.joint - 1] += float(effect.inertia)
     drawn, own = _inertia(bodies.drawn, q), _inertia(bodies.arm, q)
     share = (own + rotors) / drawn
-    if not np.all(share < _LIGHT):
-        return None
     # Inertia is linear in the base parameters.
     base = np.asarray(bodies.arm.base)
     moved = [dataclasses.replace(bodies.arm, base=base + row) for row in np.eye(len(base))]
     slopes = np.stack([_inertia(arm, q) for arm in moved]) - own
     spread = np.sqrt(np.einsum("aj,ab,bj->j", slopes, bodies.covariance, slopes)) / drawn
-    return share if np.all(share + _SURE * spread < _LIGHT) else None
+    return share, share + _SURE * spread
 
 
 def _inertia(
