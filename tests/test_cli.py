@@ -1,10 +1,12 @@
 """`jaxid fit`, `jaxid compare` and `jaxid demo`; `jaxid discover` has a file of its own."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,7 +14,7 @@ from typer.testing import CliRunner
 
 import jaxid
 import jaxid.discovery
-from jaxid.cli import app
+from jaxid.cli import app, application
 from jaxid.cli.models import load_robot, saved_model
 from jaxid.errors import ModelError
 
@@ -272,6 +274,19 @@ def test_help_has_examples_and_exit_codes(command):
 def test_colours_are_for_terminals_that_want_them(fitted):
     result, _ = fitted
     assert "\x1b" not in result.stdout + result.stderr
+
+
+@pytest.mark.parametrize("chosen", ["", "cpu,cuda"])
+def test_the_command_computes_on_the_cpu_unless_a_backend_is_chosen(chosen, monkeypatch):
+    before = jax.config.jax_platforms
+    monkeypatch.setenv("JAX_PLATFORMS", chosen)
+    monkeypatch.setattr(application, "app", lambda: None)
+    try:
+        application.main()
+        assert os.environ["JAX_PLATFORMS"] == (chosen or "cpu")
+        assert jax.config.jax_platforms == (before if chosen else "cpu")
+    finally:
+        jax.config.update("jax_platforms", before)
 
 
 def test_the_package_is_the_command_too():

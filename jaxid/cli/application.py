@@ -1,6 +1,7 @@
 """The command `jaxid`: its help, its subcommands, its entry point."""
 
 import contextlib
+import os
 from importlib import metadata
 
 import typer
@@ -67,9 +68,23 @@ app.command()(discover_all)
 app.command()(demo)
 
 
+def _use_processor() -> None:
+    """Computes on the CPU also if JAX has another backend, unless `JAX_PLATFORMS` chooses one.
+
+    A simulation is a sequence of small steps, which take many times as long on a GPU.
+    """
+    import jax
+
+    if not os.environ.get("JAX_PLATFORMS"):
+        # The variable is for processes that this one starts; JAX here has already read it.
+        os.environ["JAX_PLATFORMS"] = "cpu"
+        jax.config.update("jax_platforms", "cpu")
+
+
 def main() -> None:
     """Entry point of the `jaxid` command."""
     leave_on_interrupt()
+    _use_processor()
     # Without a writable home folder, compiled programs are not kept.
     with contextlib.suppress(OSError, RuntimeError):
         from ..compiling import keep_programs
