@@ -20,12 +20,12 @@ from jaxid.discovery.hypotheses import Hypothesis
 from jaxid.discovery.landscape import Entry, shares_a_joint
 from jaxid.discovery.last_tries import replaced
 from jaxid.discovery.likelihood import price, score, weights
+from jaxid.discovery.loose import undetermined, with_fewer, without_loose
 from jaxid.discovery.models import Model, Visited, probability
 from jaxid.discovery.score import Data
 from jaxid.discovery.search import Search
 from jaxid.discovery.signs import of_one_sign
 from jaxid.discovery.transmissions import similar_ones
-from jaxid.discovery.verify import undetermined
 from jaxid.effects import (
     AbstractEffect,
     Backlash,
@@ -278,6 +278,46 @@ def test_every_added_effect_must_be_determined(offset_case, offset_story):
 
 
 @pytest.mark.xdist_group("offset")
+def test_of_two_effects_that_take_each_others_place_one_is_fitted(offset_case, offset_story):
+    """Beside itself, an offset has no determined value."""
+    start = offset_story[0].steps[0]
+    both = with_chain(offset_case, start, TorqueOffset(joint=2), TorqueOffset(joint=2))[-1].fit
+    loose = undetermined(both, 2)
+    assert len(loose) == 2
+    search = object.__new__(Search)
+    search.added = lambda fit: fit.loop.effects[-2:]
+    search.had, search.judged = (lambda at, kept: None), (lambda added, fit: None)
+    alone = offset_story[0].fit
+    search.refitted = lambda model, kept: Model(tuple(kept), -5.0, fit=alone)
+    assert with_fewer(search, Model((), 0.0), both, loose).effects == (loose[1],)
+    none = dataclasses.replace(alone, covariance=np.full_like(alone.covariance, np.inf))
+    search.refitted = lambda model, kept: Model(tuple(kept), -5.0, fit=none)
+    assert with_fewer(search, Model((), 0.0), both, loose) is None
+    assert with_fewer(search, Model((loose[0],), 0.0), both, loose) is None
+
+
+@pytest.mark.parametrize(("percent", "replaced"), [(1.1, True), (4.0, False)])
+@pytest.mark.xdist_group("offset")
+def test_effects_without_a_determined_value_are_left_to_a_curve(
+    percent, replaced, offset_case, offset_story
+):
+    start = offset_story[0].steps[0]
+    fit = with_chain(offset_case, start, TorqueOffset(joint=2), QuadraticDrag(joint=1))[-1].fit
+    offset, drag = fit.loop.effects[-2:]
+    assert undetermined(fit, 2) == (drag,)
+    search = object.__new__(Search)
+    search.failures, search.visited = (), Visited()
+    search.at = Model((offset, drag), -50.0, fit=fit, left=np.array([1.0, 1.0]))
+    search.diagnoses = {search.at.key: SimpleNamespace(floor_percent=lambda: np.ones(2))}
+    curve = jaxid.effects.Curve(joint=1, coordinate="q", of=1)
+    search.visited.add(Model((offset,), -20.0, curve=curve, left=np.array([percent, 1.0])))
+    part = Model((offset,), 30.0, left=np.array([5.0, 1.0]))
+    search.refitted = lambda at, effects: part
+    assert without_loose(search, search.at) is (part if replaced else None)
+    assert bool(search.failures) == replaced
+
+
+@pytest.mark.xdist_group("offset")
 def test_an_amplitude_at_its_bound_does_not_exclude_an_effect(offset_case):
     """Noise makes one of the two drags negative."""
     fit, held_out = recordings_of(offset_case)
@@ -377,7 +417,7 @@ def test_two_large_effects_are_fitted_one_after_the_other():
 
 
 @pytest.mark.parametrize("left", [None, 3.0, 1.1])
-def test_an_effect_that_a_curve_replaces_is_not_part_of_the_answer(left):
+def test_an_effect_that_a_curve_replaces_is_not_part_of_the_answer(left, monkeypatch):
     """The best model is a curve with one of two effects: the answer has that effect only, even if
     it was never fitted alone, unless the other effect explains as much as the curve.
     """
@@ -399,6 +439,8 @@ def test_an_effect_that_a_curve_replaces_is_not_part_of_the_answer(left):
         return Model(tuple(effects), -30.0, left=errors[2])
 
     search.refitted = refitted
+    # Nothing has been fitted here.
+    monkeypatch.setattr("jaxid.discovery.search.without_loose", lambda search, at: None)
     if left == 1.1:
         assert search._verdict([], 0.0) == ("explained", False)
         assert len(search.at.effects) == 2
@@ -428,6 +470,11 @@ def test_sets_with_unsupported_effects_do_not_hide_a_supported_one():
         candidate(-190.0, TorqueOffset(1)),
         candidate(-150.0, Spring(1)),
     ]
+    fitted = Model((), 0.0)
+    search._fitted = lambda at, c, promised: fitted
     # A superset of a better one is left out, and so is what is far behind.
-    assert search._to_fit(sets, nothing=0.0) == [sets[2], sets[4]]
-    assert search._to_fit(sets[:2], nothing=0.0) == []
+    assert search._best_fitted(fitted, sets, 0.0) == [(fitted, sets[2]), (fitted, sets[4])]
+    assert search._best_fitted(fitted, sets[:2], 0.0) == []
+    # A set that cannot be fitted does not hide others.
+    search._fitted = lambda at, c, promised: None if c is sets[2] else fitted
+    assert search._best_fitted(fitted, sets, 0.0) == [(fitted, sets[3]), (fitted, sets[4])]

@@ -12,7 +12,15 @@ import jaxid
 from jaxid.control import Sampled
 from jaxid.discovery.models import Model
 from jaxid.discovery.remarks import looks_sampled
-from jaxid.discovery.verdict import _power, _spread, _through, on_unseen, refuted, undecided
+from jaxid.discovery.verdict import (
+    _power,
+    _spread,
+    _through,
+    indefinite,
+    on_unseen,
+    refuted,
+    undecided,
+)
 from jaxid.discovery.verify import Refits
 from jaxid.effects import Spring, TimeDelay, TorqueOffset, TorqueRipple
 from jaxid.noise import ARFilter
@@ -114,6 +122,12 @@ def test_a_fit_that_failed_is_no_verdict(found):
     assert "check the units" in asked(found, dataclasses.replace(found.fit, status=status))
     status = jaxid.Status.max_steps
     assert "did not converge" in asked(found, dataclasses.replace(found.fit, status=status))
+
+
+def test_an_effect_without_a_determined_value_is_no_answer(found):
+    assert indefinite(found.fit, 1) == ""
+    loose = dataclasses.replace(found.fit, covariance=1e12 * found.fit.covariance)
+    assert "determine no value of torque_offset on joint 2, although" in indefinite(loose, 1)
 
 
 def test_what_noise_does_not_account_for_is_no_verdict(found):

@@ -27,7 +27,16 @@ from .search import Search
 from .step import Step
 from .story import Discovery
 from .text import joined
-from .verdict import Outcome, explains_little, misfit_of, on_unseen, refuted, risen, undecided
+from .verdict import (
+    Outcome,
+    explains_little,
+    indefinite,
+    misfit_of,
+    on_unseen,
+    refuted,
+    risen,
+    undecided,
+)
 
 _STOPPED = "the search was interrupted; resume=... continues it from its saved steps"
 # Smallest weight of a model whose error on held-out recordings is computed.
@@ -175,7 +184,8 @@ def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step]) -> str:
         both = first.held_out, last.held_out
     assert last.diagnosis is not None
     worth = search.asked.worth
-    return refuted(last.fit, search.at.noise, last.diagnosis, both, worth)
+    loose = indefinite(last.fit, len(search.at.effects))
+    return loose or refuted(last.fit, search.at.noise, last.diagnosis, both, worth)
 
 
 def _tested(search: Search, steps: Sequence[Step]) -> list[Step]:

@@ -1,5 +1,6 @@
 """The models that a search has examined, and full fits of further ones."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from ..storage.campaign import Campaign
 from .asked import Asked
 from .diagnosis import Diagnosis, over_recordings
 from .fits import Fits, released_names
+from .landscape import form
 from .likelihood import score_of
 from .models import Model, Visited, listed
 from .offsets import held_offsets
@@ -96,3 +98,16 @@ class Examined:
         self.watched.begin("fit", f"fit with {listed(effects) or 'nothing'} alone")
         fit = self.fits.exchanged(at.fit.loop, at.effects, effects, at.noise)
         return self.visit(self.added(fit), fit)
+
+    def part(self, at: Model, effects: Sequence[AbstractEffect]) -> Model:
+        """The fit of a part of a model's effects, which may have other values here."""
+        fitted = self.visited.fitted(effects)
+        if fitted is not None:
+            return fitted
+        left = Counter(map(form, effects))
+        part = []
+        for effect in at.effects:
+            if left[form(effect)] > 0:
+                left[form(effect)] -= 1
+                part.append(effect)
+        return self.refitted(at, part)

@@ -16,9 +16,10 @@ from ..simulation.loop import ClosedLoop
 from .diagnosis import Diagnosis, over_recordings, share_left
 from .examined import Examined
 from .explore import DECISIVE, Candidate, explore, key_of
-from .landscape import Landscape, form, forms_of
+from .landscape import Landscape, forms_of
 from .last_tries import replaced, with_transmission, without_offset
 from .likelihood import price
+from .loose import undetermined, with_fewer, without_loose
 from .models import LIKELY, Model, Named, listed
 from .predict import Predictor
 from .ranking import Screened, judge
@@ -28,7 +29,7 @@ from .screening import carried, screen
 from .support import unsupported
 from .system import System
 from .verdict import Outcome
-from .verify import needed, undetermined
+from .verify import needed
 from .watched import ROUND
 
 # Largest number of sets that are refitted in one round, and the relative error of predicted
@@ -200,7 +201,7 @@ class Search(Examined):
         plain = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
         full = len(at.effects) >= self.asked.most
         self.without_support = frozenset()
-        tried = [] if full else self._to_fit(plain, nothing)
+        found = [] if full else self._best_fitted(at, plain, nothing)
         # Effects that explain much less than one curve only approximate the curve.
         alone = [c for c in candidates if c.curve is not None and not c.effects]
         curve = min(alone, key=lambda c: c.score, default=None)
@@ -208,7 +209,6 @@ class Search(Examined):
         limit = at.score - max(gain - max(DECISIVE, _INEXACT * gain), LIKELY)
         by_curve = None if curve is None else self._left_by(curve)
         floor = self.diagnoses[at.key].floor_percent()
-        found = [(m, c) for c in tried if (m := self._fitted(at, c, nothing - c.score)) is not None]
         better = [
             pair
             for pair in found
@@ -225,25 +225,33 @@ class Search(Examined):
         self.visited.add_predicted(rivals, at, anchor, self._left_by)
         return None if best is None else best[0]
 
-    def _to_fit(self, plain: Sequence[Candidate], nothing: float) -> list[Candidate]:
-        """The best supported set, and those that may be better after a fit.
+    def _best_fitted(
+        self, at: Model, plain: Sequence[Candidate], nothing: float
+    ) -> list[tuple[Model, Candidate]]:
+        """Refits of the best supported set, and of those that may be better after a fit.
+
+        If a set cannot be fitted, the next best one is in its place.
 
         **Arguments:**
 
         - `plain`: sets without a curve, best first. `nothing`: score of the empty set.
         """
-        found: list[Candidate] = []
+        found: list[tuple[Model, Candidate]] = []
         seen: list[Counter] = []
-        reach = np.inf
+        reach, failed = np.inf, 0
         for c in islice(plain, _EXAMINED):
-            if len(found) == _VERIFIED or c.score > reach:
+            if max(len(found), failed) == _VERIFIED or c.score > reach:
                 break
             key = Counter(c.key)
             # A set that contains a better one is left out: the smaller one is fitted first.
             if not any(x < key for x in seen) and self._supported(c):
+                model = self._fitted(at, c, nothing - c.score)
+                if model is None:
+                    failed += 1
+                    continue
                 if not found:
                     reach = c.score + max(DECISIVE, _INEXACT * (nothing - c.score))
-                found.append(c)
+                found.append((model, c))
             seen.append(key)
         return found
 
@@ -273,13 +281,10 @@ class Search(Examined):
             return None
         if not fit.status.simulated:
             return None
-        added, loose = self.added(fit), undetermined(fit, len(asked.effects))
+        loose = undetermined(fit, len(asked.effects))
         if not loose:
-            return self.visit(added, fit)
-        kept = tuple(e for e in added if not any(e is x for x in loose))
-        if len(kept) == len(at.effects):
-            return None
-        return self.had(at, kept) or self.refitted(self.judged(added, fit), kept)
+            return self.visit(self.added(fit), fit)
+        return with_fewer(self, at, fit, loose)
 
     def _without_one(self, at: Model) -> Model | None:
         """The model without one of its effects; None if all are needed.
@@ -320,6 +325,9 @@ class Search(Examined):
         return over_recordings(fit.error_percent.to_numpy() * left)
 
     def _verdict(self, candidates: Sequence[Candidate], nothing: float) -> tuple[Outcome, bool]:
+        if (less := without_loose(self, self.at)) is not None:
+            self.at = less
+            return "outside_catalogue", False
         unfinished = len(self.at.effects) >= self.asked.most
         curved = [c for c in candidates if c.curve is not None and c.score < nothing]
         mine = set(self.at.key)
@@ -330,7 +338,7 @@ class Search(Examined):
             lambda m: m.curve is not None and set(key_of(m.effects)) < mine
         )
         if rivals and rivals[0].score < self.at.score - DECISIVE:
-            part = self._part(rivals[0].effects)
+            part = self.part(self.at, rivals[0].effects)
             floor = self.diagnoses[self.at.key].floor_percent()
             if not matches_curve(part.left, self.at.left, rivals[0].left, floor):
                 self.at = part
@@ -339,16 +347,3 @@ class Search(Examined):
             return "outside_catalogue", False
         left = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
         return ("explained" if self.at.effects else "adequate"), unfinished and bool(left)
-
-    def _part(self, effects: Sequence[AbstractEffect]) -> Model:
-        """The fit of a part of the chosen model's effects, which may come from a prediction."""
-        fitted = self.visited.fitted(effects)
-        if fitted is not None:
-            return fitted
-        left = Counter(map(form, effects))
-        part = []
-        for effect in self.at.effects:
-            if left[form(effect)] > 0:
-                left[form(effect)] -= 1
-                part.append(effect)
-        return self.refitted(self.at, part)

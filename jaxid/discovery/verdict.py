@@ -17,7 +17,8 @@ from .explore import DECISIVE
 from .floor import SPOKEN, Floor, floor_of
 from .hypotheses import effect_on
 from .likelihood import weights
-from .models import LIKELY, Model, Named, probability
+from .loose import undetermined
+from .models import LIKELY, Model, Named, listed, probability
 from .relevance import REFUTED, allowed
 from .score import spanned
 from .step import OnUnseen
@@ -108,6 +109,23 @@ def _incomplete(models: Sequence[Model], chosen: Model) -> str:
     return (
         f"models with a further effect have a probability of {share:.3g}, most of all "
         f"{effect_on(*further)}: record more, or longer"
+    )
+
+
+def indefinite(chosen: Fit, added: int) -> str:
+    """The reason if recordings determine no value of an added effect; empty if there is none.
+
+    **Arguments:**
+
+    - `chosen`: the fit of the model with the best score.
+    - `added`: number of added effects; these are its loop's last ones.
+    """
+    loose = undetermined(chosen, added)
+    if not loose:
+        return ""
+    return (
+        f"the recordings determine no value of {listed(loose)}, although the error is larger "
+        "without: together the added effects may approximate another law; record other motions"
     )
 
 

@@ -157,36 +157,19 @@ def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
     - `price`: price of the choice of effects in the score.
     """
     place = next(k for k, e in enumerate(fit.loop.effects) if e is effect)
-    values_of = _values_of(fit.loop, place)
-    own = [k for k, linear in values_of if linear]
+    places = values_of(fit.loop, place)
+    own = [k for k, linear in places if linear]
     covariance = fit.covariance[np.ix_(own, own)]
     if effect.finite or not own or not np.isfinite(covariance).all():
         return False
     values = fit.theta[own]
     # The increase of the squared error without the effect (Wald), and the decrease of the price.
     lost = float(values @ np.linalg.pinv(covariance) @ values)
-    saved = len(values_of) * np.log(sum(r.size for r in fit.residuals)) + price
+    saved = len(places) * np.log(sum(r.size for r in fit.residuals)) + price
     return bool(lost > (_RESHAPED if reshaped(fit.loop, effect) else _CERTAIN) * saved)
 
 
-def undetermined(found: Fit, added: int) -> tuple[AbstractEffect, ...]:
-    """The effects, of those that a refit has added, of which the recordings determine no value.
-
-    A value is determined if its standard deviation is less than its size. If none is, the effect
-    is absent, or other parameters of the model can take its place.
-
-    **Arguments:**
-
-    - `added`: number of added effects; these are the loop's last ones.
-    """
-    effects = found.loop.effects
-    last = range(len(effects) - added, len(effects))
-    values = {k: [place for place, _ in _values_of(found.loop, k)] for k in last}
-    known = found.std < np.abs(found.theta)
-    return tuple(effects[k] for k, own in values.items() if own and not known[own].any())
-
-
-def _values_of(loop: ClosedLoop, place: int) -> list[tuple[int, bool]]:
+def values_of(loop: ClosedLoop, place: int) -> list[tuple[int, bool]]:
     """The places of an effect's values in `theta`, each with whether torque is linear in it."""
     at, own = 0, []
     for p in loop.free_parameters:
