@@ -71,8 +71,9 @@ def discover(
     - `catalogue`: as for `diagnose`.
     - `method`: settings of the fits, an `OEM`; by default `OEM()`.
     - `significance`: corrected p-value below which a diagnosis reports a missing effect.
-    - `worth`: smallest relevant change of a joint's torque, in % of its norm. An effect that
-      changes the torque of every joint by less is not added.
+    - `worth`: smallest relevant change of a joint's torque, in % of its norm, and at least a tenth
+      of the model's error, or a quarter if the law is unknown. An effect that changes the torque
+      of every joint by less is not added.
     - `most`: largest number of effects to add.
     - `resume`: folder in which every fit is saved as it ends, and from which the same call
       continues; it is created if it does not exist.

@@ -9,9 +9,10 @@ from .diagnosis import over_recordings
 from .explore import Candidate
 from .models import Model
 
-# Smallest relevant effect if the law is unknown, as a share of the residual: filters on motion and
-# torque, ticks and stiction cause errors of this size even in good recordings.
-_SMALL = 0.25
+# Smallest relevant effect as a share of the residual. If the law is unknown, filters on motion and
+# torque, ticks and stiction cause errors of this size even in good recordings. If it is known, laws
+# of friction and encoder steps that differ a little from the model do.
+_SMALL, _SMALL_KNOWN = 0.25, 0.1
 # For these reasons an error of 1.3 times that of noise is allowed then, or an excess of 0.2 %.
 _BLURRED, _BLUR = 1.30, 0.2
 # The same ratio if the law is known. The noise of recordings of one arm differs by a few per cent;
@@ -101,5 +102,5 @@ def _least(
     - `percent`: relative error of each joint's torque, %.
     """
     assert at.fit is not None
-    share = _SMALL if imposed(at.fit.loop) else 0.0
+    share = _SMALL if imposed(at.fit.loop) else _SMALL_KNOWN
     return np.maximum(worth, share * percent)
