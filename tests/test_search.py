@@ -23,7 +23,7 @@ from jaxid.discovery.likelihood import price, score, weights
 from jaxid.discovery.loose import undetermined, with_fewer, without_loose
 from jaxid.discovery.models import Model, Visited, probability
 from jaxid.discovery.score import Data
-from jaxid.discovery.search import Search
+from jaxid.discovery.search import Search, _lost
 from jaxid.discovery.signs import of_one_sign
 from jaxid.discovery.transmissions import similar_ones
 from jaxid.effects import (
@@ -457,7 +457,7 @@ def candidate(score: float, *effects) -> Candidate:
     return found
 
 
-def test_sets_with_unsupported_effects_do_not_hide_a_supported_one():
+def test_sets_with_unsupported_effects_do_not_hide_a_supported_one(monkeypatch):
     """A pair whose second effect fits one stretch is skipped, and the best other set is fitted."""
     search = object.__new__(Search)
     search._supported = lambda c: not any(isinstance(e, RotorInertia) for e in c.effects)
@@ -470,6 +470,7 @@ def test_sets_with_unsupported_effects_do_not_hide_a_supported_one():
         candidate(-190.0, TorqueOffset(1)),
         candidate(-150.0, Spring(1)),
     ]
+    monkeypatch.setattr("jaxid.discovery.search._lost", lambda model, at: model.score > at.score)
     fitted = Model((), 0.0)
     search._fitted = lambda at, c, promised: fitted
     # A superset of a better one is left out, and so is what is far behind.
@@ -478,3 +479,16 @@ def test_sets_with_unsupported_effects_do_not_hide_a_supported_one():
     # A set that cannot be fitted does not hide others.
     search._fitted = lambda at, c, promised: None if c is sets[2] else fitted
     assert search._best_fitted(fitted, sets, 0.0) == [(fitted, sets[3]), (fitted, sets[4])]
+    worse = Model((), 1.0)
+    search._fitted = lambda at, c, promised: worse if c is sets[2] else fitted
+    assert search._best_fitted(fitted, sets, 0.0) == [(fitted, sets[3]), (fitted, sets[4])]
+
+
+@pytest.mark.xdist_group("offset")
+def test_a_fit_that_does_not_converge_and_is_worse_has_lost_its_minimum(offset_story):
+    fit = offset_story[0].fit
+    stopped = dataclasses.replace(fit, status=jaxid.Status.max_steps)
+    at = Model((), 0.0, fit=fit)
+    assert _lost(Model((), 1.0, fit=stopped), at)
+    assert not _lost(Model((), 1.0, fit=fit), at)
+    assert not _lost(Model((), -1.0, fit=stopped), at)

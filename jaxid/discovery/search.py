@@ -230,7 +230,8 @@ class Search(Examined):
     ) -> list[tuple[Model, Candidate]]:
         """Refits of the best supported set, and of those that may be better after a fit.
 
-        If a set cannot be fitted, the next best one is in its place.
+        If a set cannot be fitted, or if its fit does not converge and is worse than the model
+        without it, the next best one is in its place.
 
         **Arguments:**
 
@@ -246,7 +247,7 @@ class Search(Examined):
             # A set that contains a better one is left out: the smaller one is fitted first.
             if not any(x < key for x in seen) and self._supported(c):
                 model = self._fitted(at, c, nothing - c.score)
-                if model is None:
+                if model is None or _lost(model, at):
                     failed += 1
                     continue
                 if not found:
@@ -347,3 +348,9 @@ class Search(Examined):
             return "outside_catalogue", False
         left = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
         return ("explained" if self.at.effects else "adequate"), unfinished and bool(left)
+
+
+def _lost(model: Model, at: Model) -> bool:
+    """Whether a fit with more effects than another one has not found its minimum."""
+    assert model.fit is not None
+    return not model.fit.succeeded and model.score > at.score

@@ -60,7 +60,7 @@ class Refits(eqx.Module):
         with a held stiffness has many local minima, so further refits start with the stiffness
         free. If the score decreases much more or much less than predicted, the refit is repeated
         from a fit that assumes white noise; of several effects, also from fits of one after the
-        other.
+        other, in both orders.
 
         **Arguments:**
 
@@ -84,9 +84,9 @@ class Refits(eqx.Module):
         gained = score_of(before).value - score_of(best).value
         if len(starts) == 1 and not promised / _FAR < gained < promised * _FAR:
             best = self.best([best, self.filtered(self.unfiltered(loop, noise).loop, noise)])
-            gained = score_of(before).value - score_of(best).value
-        if len(effects) > 1 and gained < promised / _FAR:
-            best = self.best([best, self.filtered(self.in_turn(before, effects, noise), noise)])
+        for order in (effects, effects[::-1]) if len(effects) > 1 else ():
+            if score_of(before).value - score_of(best).value < promised / _FAR:
+                best = self.best([best, self.filtered(self.in_turn(before, order, noise), noise)])
         loose = [name for name in held if name not in best.loop.names]
         if loose:
             best = self.best([best, self.filtered(best.loop.free(*loose), noise)])
