@@ -117,6 +117,14 @@ def test_a_limited_torque_that_the_motion_does_not_explain_is_a_mistake(clean):
         assert ("is at its largest value in" in found.mistake) == is_named
 
 
+def test_torque_that_has_nothing_to_do_with_the_motion_is_a_mistake(clean):
+    unknown = dataclasses.replace(jaxid.scara(), controller=jaxid.control.Tracking())
+    rng = np.random.default_rng(0)
+    noise = spoilt(clean, lambda r: {"tau": rng.normal(size=r.tau.shape)})
+    found = jaxid.fit(unknown, noise, jaxid.OEM(progress=False))
+    assert "explains nothing of the torque" in found.mistake
+
+
 def test_a_fit_names_the_mistake_first(clean):
     change, said = MISTAKES["swapped"]
     unknown = dataclasses.replace(jaxid.scara(), controller=jaxid.control.Tracking())

@@ -185,9 +185,24 @@ def _examined(found: Fit, loop: ClosedLoop) -> Fit:
         return found
     largest = float((found.error_percent * _of_motion(found)).to_numpy().max())
     mistake = "" if largest < LARGE_PERCENT else likely_mistake(loop, found.recordings)
-    mistake = mistake or _limited(found) or contradiction(found)
+    mistake = mistake or _unrelated(found) or _limited(found) or contradiction(found)
     notes = (mistake, *found.notes) if mistake else found.notes
     return dataclasses.replace(found, mistake=mistake, notes=notes)
+
+
+# Relative error, %, above which torque has nothing to do with the motion.
+_UNRELATED_PERCENT = 95.0
+
+
+def _unrelated(found: Fit) -> str:
+    """A sentence if the motion explains the torque of no joint, although it is known."""
+    least = float(found.error_percent.to_numpy().min())
+    if not found.loop.controller.imposes or least < _UNRELATED_PERCENT:
+        return ""
+    return (
+        f"the recorded motion explains nothing of the torque (error {least:.3g} % at least): check "
+        "that both are of the same robot and time, and that the torque is not noise"
+    )
 
 
 def _limited(found: Fit) -> str:
