@@ -76,7 +76,7 @@ def _same(r: Signals, j: int) -> Signals:
 # By name: the change of a recording, and words of which a correct reason contains one.
 MISTAKES: dict[str, tuple[Mistake, tuple[str, ...]]] = {
     "sign of torque": (_scaled("tau", -1.0), ("sign",)),
-    "degrees or millimetres": (_scaled("q", 57.3), ("in degrees", "in mm")),
+    "degrees or millimetres": (_scaled("q", 57.3), ("in degrees", "in mm", "unit of the position")),
     "torques swapped": (_swapped, ("swapped",)),
     "clock twice as fast": (_clock, ("clock", "time stamps")),
     "torque of noise": (_noise, ("noise", "no better than none", "units")),

@@ -280,9 +280,8 @@ def test_colours_are_for_terminals_that_want_them(fitted):
 def test_the_command_computes_on_the_cpu_unless_a_backend_is_chosen(chosen, monkeypatch):
     before = jax.config.jax_platforms
     monkeypatch.setenv("JAX_PLATFORMS", chosen)
-    monkeypatch.setattr(application, "app", lambda: None)
     try:
-        application.main()
+        application._use_processor()
         assert os.environ["JAX_PLATFORMS"] == (chosen or "cpu")
         assert jax.config.jax_platforms == (before if chosen else "cpu")
     finally:
