@@ -217,8 +217,8 @@ def _limited(found: Fit) -> str:
     if not said:
         return ""
     return (
-        f"{said}, and the motion does not explain it (error {errors.max():.3g} %): cut out these "
-        "stretches, or record a slower motion"
+        f"{said}, and the motion leaves more than {DOUBTFUL_PERCENT:.0f} % of it unexplained: cut "
+        "out these stretches, or record a slower motion"
     )
 
 

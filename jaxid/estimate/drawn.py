@@ -87,7 +87,7 @@ def _bodies_of(found: Fit) -> _Bodies | None:
 def _inertias(
     found: Fit, bodies: _Bodies
 ) -> tuple[Float[np.ndarray, " joints"], Float[np.ndarray, " joints"]]:
-    """Shares of the drawn inertia, and the largest ones that are not significantly too large."""
+    """Shares of the drawn inertia, and their upper limits of three standard deviations."""
     q = np.concatenate([r.q for r in found.recordings])
     rotors = np.zeros(bodies.arm.joints)
     for effect in found.loop.effects:
@@ -95,6 +95,9 @@ def _inertias(
             rotors[effect.joint - 1] += float(effect.inertia)
     drawn, own = _inertia(bodies.drawn, q), _inertia(bodies.arm, q)
     share = (own + rotors) / drawn
+    if not (np.any(share < _UNIT) or np.all(share < _LIGHT)):
+        # No limit is needed, and each base parameter takes another evaluation.
+        return share, share
     # Inertia is linear in the base parameters.
     base = np.asarray(bodies.arm.base)
     moved = [dataclasses.replace(bodies.arm, base=base + row) for row in np.eye(len(base))]
