@@ -35,6 +35,7 @@ from jaxid.effects import (
     RotorInertia,
     Spring,
     Stribeck,
+    TimeDelay,
     TorqueOffset,
     TorqueRipple,
     on_joint,
@@ -252,14 +253,22 @@ def test_a_close_rival_that_was_only_predicted_is_fitted(offset_case, offset_sto
 def test_a_fitted_elasticity_may_be_a_gap(offset_case):
     asked = search_of(offset_case).asked
     soft = JointElasticity(joint=2, compliance=1e-3, rotor=0.1)
-    ((effect, gap),) = similar_ones((TorqueOffset(joint=1), soft), asked)
+    ((effect, gap),) = similar_ones((TorqueOffset(joint=1), soft), asked, ())
     assert effect is soft
     assert isinstance(gap, Backlash)
     assert (gap.joint, float(gap.rotor)) == (2, 0.1)
     assert float(gap.stiffness) == pytest.approx(1e3)
     load = np.sqrt(np.mean(np.concatenate([r.tau[:, 1] for r in asked.recordings]) ** 2))
     assert float(gap.gap) == pytest.approx(2e-3 * load)
-    assert list(similar_ones((gap,), asked)) == []
+    assert list(similar_ones((gap,), asked, ())) == []
+
+
+def test_a_late_drive_may_be_a_soft_joint(offset_case):
+    asked = search_of(offset_case).asked
+    soft, late = JointElasticity(joint=2, compliance=1e-3), TimeDelay(joint=2, delay=0.01)
+    screened = (soft, JointElasticity(joint=1), Spring(joint=2))
+    pairs = similar_ones((late, TorqueOffset(joint=2)), asked, screened)
+    assert [(id(a), id(b)) for a, b in pairs] == [(id(late), id(soft))]
 
 
 @pytest.mark.xdist_group("offset")
@@ -455,6 +464,23 @@ def candidate(score: float, *effects) -> Candidate:
     for name, value in (("effects", effects), ("score", score), ("curve", None)):
         object.__setattr__(found, name, value)
     return found
+
+
+def test_sets_without_determined_values_do_not_hide_a_curve(monkeypatch):
+    """Two ripples and a drag are predicted to explain more than a curve does."""
+    monkeypatch.setattr("jaxid.discovery.search.without_loose", lambda search, at: None)
+    search = object.__new__(Search)
+    search.asked, search.visited = SimpleNamespace(most=5), Visited()
+    search.at = Model((), 0.0)
+    pair, more = (TorqueRipple(2), TorqueRipple(2, 0.1)), QuadraticDrag(1)
+    curve = candidate(-200.0)
+    object.__setattr__(curve, "curve", jaxid.effects.Curve(joint=2, coordinate="q", of=2))
+    sets = [candidate(-300.0, *pair), candidate(-290.0, *pair, more), curve, candidate(0.0)]
+    assert search._verdict(sets, 0.0) == ("adequate", False)
+    search.loose = frozenset({sets[0].key})
+    assert search._verdict(sets, 0.0) == ("outside_catalogue", False)
+    # A set whose values are determined is no approximation of a curve.
+    assert search._verdict([candidate(-250.0, more), *sets], 0.0) == ("adequate", False)
 
 
 def test_sets_with_unsupported_effects_do_not_hide_a_supported_one(monkeypatch):

@@ -13,7 +13,7 @@ import jaxid
 from jaxid.discovery.finite import differences
 from jaxid.discovery.hypotheses import amplitudes, survey
 from jaxid.discovery.linear import linearise
-from jaxid.discovery.signatures import signatures
+from jaxid.discovery.signatures import Placed, force_and_slopes, signatures
 from jaxid.effects import (
     AbstractEffect,
     ActuatorLag,
@@ -221,3 +221,25 @@ def test_friction_of_a_slider_may_rise_along_its_travel():
     ramp, matrix = travel[:, 0], np.concatenate(columns, axis=1)
     left = ramp - matrix @ np.linalg.lstsq(matrix, ramp)[0]
     assert np.linalg.norm(left) < 0.02 * np.linalg.norm(ramp - ramp.mean())
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_a_delayed_command_is_the_one_of_a_moment_ago(even):
+    """Also if samples are not evenly spaced, and for its derivative by the delay."""
+    rng, delay, samples = np.random.default_rng(2), 0.02, 2000
+    steps = np.full(samples, 1e-3) if even else rng.uniform(0.5e-3, 1.5e-3, samples)
+    time = np.cumsum(steps)
+
+    def at(t):
+        still = jnp.zeros(1)
+        command = jnp.sin(20 * t)[None]
+        return Motion(t, still, still, still, command, jnp.zeros(0), jnp.asarray(0))
+
+    motion = jax.vmap(jax.vmap(at))(jnp.asarray(time)[None])
+    placed = Placed.of(TimeDelay(joint=1, delay=delay), 1)
+    push = np.asarray(force_and_slopes(placed, motion, motion.q)[0])[0, :, 0]
+    settled = time > 20 * delay
+    late = np.sin(20 * (time - delay)) - np.sin(20 * time)
+    rate = -20 * np.cos(20 * (time - delay))
+    np.testing.assert_allclose(push[settled, 0], late[settled], atol=2e-4)
+    np.testing.assert_allclose(push[settled, 1], rate[settled], atol=2e-2)

@@ -1,13 +1,13 @@
 """The noise floor of a fit from its recordings alone: the part that no model can explain."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from ..noise import Level, above_motion, from_repeats
-from ..recording import Recordings
+from ..recording import Recording, Recordings
 from ..signals.smoothing import signal_cutoff
 from ..signals.standstill import Standstill
 from ..simulation.batch import band_of, compared
@@ -35,7 +35,9 @@ class Floor(eqx.Module):
     sources: tuple[tuple[str, ...], ...] = eqx.field(static=True)
 
 
-def floor_of(loop: ClosedLoop, recordings: Recordings) -> Floor | None:
+def floor_of(
+    loop: ClosedLoop, recordings: Recordings, beside: Iterable[Recording] = ()
+) -> Floor | None:
     """The noise floor of compared signals, from repeats of a reference or above the motion.
 
     None if positions are compared.
@@ -43,21 +45,27 @@ def floor_of(loop: ClosedLoop, recordings: Recordings) -> Floor | None:
     **Arguments:**
 
     - `loop`: its controller determines the compared signals; its model is not used.
+    - `beside`: further recordings of the robot. They may repeat a reference, or show that noise is
+      not white.
     """
     if loop.controller.judged == "position":
         return None
+    asked = len(recordings)
+    recordings = Recordings.of((*recordings, *beside))
     repeats = from_repeats(recordings, lambda pair, rows: compared(loop, pair, list(rows)))
     band = band_of(loop, recordings)
     torque = compared(loop, recordings, [r.tau for r in recordings])
-    levels: list[tuple[Level | None, ...]] = []
-    for k, r in enumerate(recordings):
-        cutoff = loop.controller.comparable(r) or signal_cutoff(r)
-        moving = Standstill().moving(r, cutoff)
-        share = 1.0 if band is None else float(np.mean(np.asarray(band.gain[k]) ** 2))
-        above = above_motion(r, cutoff, moving, share)
-        pairs = zip(repeats.get(r.name, above), above, strict=True)
-        levels.append(tuple(x or y for x, y in pairs))
-    return _relative(levels, torque)
+    cutoffs = [loop.controller.comparable(r) or signal_cutoff(r) for r in recordings]
+    moving = [Standstill().moving(r, cutoff) for r, cutoff in zip(recordings, cutoffs, strict=True)]
+    gains = np.ones((len(cutoffs), 1)) if band is None else [np.asarray(x) for x in band.gain]
+    shares = [float(np.mean(np.square(gain))) for gain in gains]
+    levels = [
+        tuple(x or y for x, y in zip(repeats.get(r.name, above), above, strict=True))
+        for r, above in zip(
+            recordings, above_motion(recordings, cutoffs, moving, shares), strict=True
+        )
+    ]
+    return _relative(levels[:asked], torque[:asked])
 
 
 def _relative(levels: Sequence[tuple[Level | None, ...]], torque: Sequence[np.ndarray]) -> Floor:

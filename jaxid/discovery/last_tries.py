@@ -63,8 +63,9 @@ def with_transmission(search: Examined, at: Model) -> Model | None:
         if search.visited.fitted((*at.effects, effect)) is None:
             best = _better(search, best, (effect,), _added(search, at, effect, at.noise))
     if diagnosis.depends_on():
-        # One transmission may only resemble another.
-        for effect, similar in similar_ones(at.effects, search.asked):
+        # Each of them may only resemble a transmission.
+        screened = [v.hypothesis.effect for v in diagnosis.forms]
+        for effect, similar in similar_ones(at.effects, search.asked, screened):
             rest = tuple(e for e in at.effects if e is not effect)
             if search.visited.fitted((*rest, similar)) is None:
                 less = search.had(at, rest) or search.refitted(at, rest)

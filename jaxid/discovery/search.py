@@ -54,6 +54,8 @@ class Search(Examined):
     latest: tuple[Screened, Diagnosis] | None = None
     # Sets of the last prediction of which an effect does not explain stretches that were left out.
     without_support: frozenset[tuple] = frozenset()
+    # Those of which a fit determines no value of an effect.
+    loose: frozenset[tuple] = frozenset()
 
     def run(self, loop: ClosedLoop) -> tuple[Outcome, bool]:
         """Predicts and verifies in rounds, until no model has a lower score.
@@ -200,7 +202,7 @@ class Search(Examined):
         """The best refit of the best predicted sets; None if none is better than the model."""
         plain = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
         full = len(at.effects) >= self.asked.most
-        self.without_support = frozenset()
+        self.without_support = self.loose = frozenset()
         found = [] if full else self._best_fitted(at, plain, nothing)
         # Effects that explain much less than one curve only approximate the curve.
         alone = [c for c in candidates if c.curve is not None and not c.effects]
@@ -220,8 +222,9 @@ class Search(Examined):
         ]
         best = min(better, key=lambda pair: pair[0].score, default=None)
         anchor = at.score - nothing if best is None else best[0].score - best[1].score
-        # A set without support is no rival of the chosen one.
-        rivals = [c for c in candidates if c.key not in self.without_support]
+        # A set without support or without determined values is no rival of the chosen one.
+        excluded = self.without_support | self.loose
+        rivals = [c for c in candidates if c.key not in excluded]
         self.visited.add_predicted(rivals, at, anchor, self._left_by)
         return None if best is None else best[0]
 
@@ -262,11 +265,13 @@ class Search(Examined):
         lacking = unsupported(predictor, c) if imposed(fit.loop) else ()
         if lacking:
             self.without_support |= {c.key}
-            said = (
+            self._note(
                 f"{listed(lacking)}: does not explain stretches that were left out of its estimate"
             )
-            self.failures = tuple(dict.fromkeys((*self.failures, said)))
         return not lacking
+
+    def _note(self, said: str) -> None:
+        self.failures = tuple(dict.fromkeys((*self.failures, said)))
 
     def _fitted(self, at: Model, asked: Candidate, promised: float) -> Model | None:
         """A full refit with those additional effects that it determines; None if it fails."""
@@ -278,13 +283,15 @@ class Search(Examined):
             fit = self.fits.with_effects(at.fit, at.effects, asked.effects, asked.noise, promised)
         except (ModelError, FitError) as error:
             # The candidate cannot be simulated at the predicted values.
-            self.failures = (*self.failures, f"no fit with {listed(asked.effects)}: {error}")
+            self._note(f"no fit with {listed(asked.effects)}: {error}")
             return None
         if not fit.status.simulated:
             return None
         loose = undetermined(fit, len(asked.effects))
         if not loose:
             return self.visit(self.added(fit), fit)
+        self.loose |= {asked.key}
+        self._note(f"{listed(asked.effects)}: the fit determines no value of {listed(loose)}")
         return with_fewer(self, at, fit, loose)
 
     def _without_one(self, at: Model) -> Model | None:
@@ -344,9 +351,13 @@ class Search(Examined):
             if not matches_curve(part.left, self.at.left, rivals[0].left, floor):
                 self.at = part
                 return "outside_catalogue", False
-        if curved and curved[0].score == min(c.score for c in candidates):
+        # Sets whose effects have no determined value only approximate a curve.
+        loose = [Counter(key) for key in self.loose]
+        plain = [c for c in candidates if c.curve is None]
+        sets = [c for c in plain if not any(x <= Counter(c.key) for x in loose)]
+        if curved and curved[0].score <= min(c.score for c in sets):
             return "outside_catalogue", False
-        left = [c for c in candidates if c.effects and c.curve is None and c.score < nothing]
+        left = [c for c in plain if c.effects and c.score < nothing]
         return ("explained" if self.at.effects else "adequate"), unfinished and bool(left)
 
 

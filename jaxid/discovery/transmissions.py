@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..effects import AbstractEffect, AbstractTransmission
+from ..effects import AbstractEffect, AbstractTransmission, ActuatorLag, TimeDelay
 from .asked import Asked
 from .diagnosis import Diagnosis
 
@@ -30,12 +30,22 @@ def suspected(diagnosis: Diagnosis) -> tuple[AbstractEffect, ...]:
 
 
 def similar_ones(
-    effects: Sequence[AbstractEffect], asked: Asked
-) -> Iterator[tuple[AbstractTransmission, AbstractTransmission]]:
-    """The fitted transmissions, each with those of the catalogue that it may only resemble.
+    effects: Sequence[AbstractEffect], asked: Asked, screened: Sequence[AbstractEffect]
+) -> Iterator[tuple[AbstractEffect, AbstractEffect]]:
+    """The fitted effects that may only resemble a transmission, each with that transmission.
 
-    An elasticity resembles a gap as wide as its twist under load.
+    An elasticity resembles a gap as wide as its twist under load. A soft joint, beyond what
+    screening simulates, first resembles a late drive.
+
+    **Arguments:**
+
+    - `screened`: screened effects at their best settings.
     """
+    for effect in effects:
+        if isinstance(effect, (ActuatorLag, TimeDelay)):
+            for other in screened:
+                if isinstance(other, AbstractTransmission) and other.joint == effect.joint:
+                    yield effect, other
     load = np.sqrt(np.mean(np.concatenate([r.tau for r in asked.recordings]) ** 2, axis=0))
     kinds: list[Any] = [
         c for c in asked.catalogue if isinstance(c, type) and issubclass(c, AbstractTransmission)

@@ -163,7 +163,7 @@ def refuted(
     return (
         risen(before, after, noise, worth)
         or _above_noise(chosen, after, noise, worth)
-        or _above_measured(after, floor_of(after.loop, after.recordings), worth)
+        or _above_measured(after, floor_of(after.loop, after.recordings, chosen.recordings), worth)
     )
 
 

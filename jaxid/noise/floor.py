@@ -40,29 +40,47 @@ class Level(eqx.Module):
 
 
 def above_motion(
-    recording: Recording,
-    cutoff: float,
-    moving: Bool[np.ndarray, "samples joints"],
-    share: float,
-) -> tuple[Level | None, ...]:
-    """Noise by joint from the torque's spectrum above the frequencies of the motion.
+    recordings: Recordings,
+    cutoffs: Sequence[float],
+    moving: Sequence[Bool[np.ndarray, "_ joints"]],
+    shares: Sequence[float],
+) -> list[tuple[Level | None, ...]]:
+    """Noise by recording and joint from the torque's spectrum above the frequencies of the motion.
 
     A rigid arm has no torque at these frequencies; neither has friction while a joint keeps its
     direction. Noise that is white above the motion's frequencies is assumed to be white below them.
-    If it is not white, it cannot be extrapolated, and None is returned.
+    If it is not white, it cannot be extrapolated, and None is returned: for one recording if the
+    noise is not white there, for all of them if it is not white in all together.
 
     **Arguments:**
 
-    - `cutoff`: frequency up to which the motion is known, Hz.
+    - `cutoffs`: frequencies up to which the motion is known, by recording, Hz.
     - `moving`: samples at which a joint moves without a nearby reversal; their windows are used.
-    - `share`: share of the power of white noise that remains in the compared signals.
+    - `shares`: shares of the power of white noise that remain in the compared signals.
     """
+    spectra = [_above(*row) for row in zip(recordings, cutoffs, moving, strict=True)]
+    by_joint = []
+    for powers in zip(*spectra, strict=True):
+        tilts = [_tilt(power) for power in powers]
+        flat = _white([t for t in tilts if t is not None])
+        levels = [
+            _level(power, tilt, share) if flat and tilt is not None and _white([tilt]) else None
+            for power, tilt, share in zip(powers, tilts, shares, strict=True)
+        ]
+        by_joint.append(levels)
+    return list(zip(*by_joint, strict=True))
+
+
+def _above(
+    recording: Recording, cutoff: float, moving: Bool[np.ndarray, "samples joints"]
+) -> list[Float[np.ndarray, "windows bins"]]:
+    """Spectrum by joint in windows without a reversal; without rows if it is not known."""
     import scipy
 
     grid = np.fft.rfftfreq(_WINDOW, recording.period)
     used = (grid >= _ABOVE * cutoff) & (grid < _UNTIL * recording.rate / 2)
     if used.sum() < _BINS or recording.samples < 4 * _WINDOW:
-        return (None,) * recording.joints
+        return [np.zeros((0, 0))] * recording.joints
     # Otherwise the motion, a thousand times as strong, would leak into these frequencies.
     high = recording.tau - low_pass(recording.tau, recording.rate, cutoff)
     taper = np.asarray(scipy.signal.get_window("hann", _WINDOW))
@@ -70,11 +88,11 @@ def above_motion(
     rows = first[:, None] + np.arange(_WINDOW)
     power = np.abs(np.fft.rfft(high[rows] * taper[:, None], axis=1)) ** 2 / np.sum(taper**2)
     there = np.all(moving[rows], axis=1)
-    return tuple(_white(power[there[:, j]][:, used, j], share) for j in range(recording.joints))
+    return [power[there[:, j]][:, used, j] for j in range(recording.joints)]
 
 
-def _white(power: Float[np.ndarray, "windows bins"], share: float) -> Level | None:
-    """Level of white noise from its spectrum in windows; None if it is not white."""
+def _tilt(power: Float[np.ndarray, "windows bins"]) -> tuple[float, float] | None:
+    """Logarithm of the ratio of power in both halves of the frequencies, and its deviation."""
     if len(power) < _WINDOWS:
         return None
     lower, upper = (part.mean(axis=1) for part in np.array_split(power, 2, axis=1))
@@ -82,13 +100,29 @@ def _white(power: Float[np.ndarray, "windows bins"], share: float) -> Level | No
         return None
     # The median over windows is robust against a step in one of them.
     ratios = np.log(lower / upper)
-    slope = np.median(ratios)
-    chance = 1.25 * np.median(abs(ratios - slope)) / 0.674 / np.sqrt(0.6 * len(ratios))
-    if chance > _UNSURE or (abs(slope) > _COLOURED and abs(slope) > _SURE * chance):
-        return None
+    slope = float(np.median(ratios))
+    spread = float(np.median(abs(ratios - slope)))
+    return slope, 1.25 * spread / 0.674 / float(np.sqrt(0.6 * len(ratios)))
+
+
+def _white(tilts: Sequence[tuple[float, float]]) -> bool:
+    """Whether the mean of tilts, weighted by their precision, is that of white noise."""
+    if not tilts:
+        return False
+    slopes, chances = np.array(tilts).T
+    precision = 1 / np.maximum(chances, 1e-6) ** 2
+    chance = 1 / np.sqrt(precision.sum())
+    slope = abs(slopes @ precision) * chance**2
+    return bool(chance <= _UNSURE and slope <= max(_COLOURED, _SURE * chance))
+
+
+def _level(
+    power: Float[np.ndarray, "windows bins"], tilt: tuple[float, float], share: float
+) -> Level:
+    """Level of white noise from its spectrum in windows."""
     mean, spread = share * power.mean(), _relative(power.mean(axis=1))
     # Includes a possible slope of the spectrum that is too small to be detected.
-    reach = 2 * np.hypot(spread, max(abs(slope), chance))
+    reach = 2 * np.hypot(spread, max(abs(tilt[0]), tilt[1]))
     value = np.sqrt(mean)
     return Level(value, value * np.exp(-reach / 2), value * np.exp(reach / 2), "above the motion")
 
