@@ -15,6 +15,7 @@ from stories import recordings_of, search_of, with_chain
 
 import jaxid
 from jaxid.discovery.bounded import bounded_amplitudes
+from jaxid.discovery.diagnosis import Diagnosis
 from jaxid.discovery.explore import Candidate, _fitted, _plain, key_of
 from jaxid.discovery.hypotheses import Hypothesis
 from jaxid.discovery.landscape import Entry, shares_a_joint
@@ -25,12 +26,16 @@ from jaxid.discovery.models import Model, Visited, probability
 from jaxid.discovery.score import Data
 from jaxid.discovery.search import Search, _lost
 from jaxid.discovery.signs import of_one_sign
-from jaxid.discovery.transmissions import similar_ones
+from jaxid.discovery.transmissions import similar_ones, suspected
 from jaxid.effects import (
     AbstractEffect,
     Backlash,
+    EncoderEccentricity,
+    Gravity,
+    Hysteresis,
     JointElasticity,
     Motion,
+    Payload,
     QuadraticDrag,
     RotorInertia,
     Spring,
@@ -38,6 +43,7 @@ from jaxid.effects import (
     TimeDelay,
     TorqueOffset,
     TorqueRipple,
+    TorqueSaturation,
     on_joint,
 )
 from jaxid.parameters import Scalar, parameter
@@ -263,6 +269,23 @@ def test_a_fitted_elasticity_may_be_a_gap(offset_case):
     assert list(similar_ones((gap,), asked, ())) == []
 
 
+def test_a_significant_limit_is_fitted_from_one_that_acts():
+    """Screened limits of the other joint are not significant."""
+    limits = [TorqueSaturation(joint=j, limit=10.0) for j in (1, 2)]
+    gap = Backlash(joint=1, gap=0.1)
+    verdicts = [
+        SimpleNamespace(hypothesis=SimpleNamespace(effect=e, joint=e.joint), p_value=p)
+        for e, p in zip((*limits, gap), (1e-6, 0.5, 1e-6), strict=True)
+    ]
+    diagnosis = object.__new__(Diagnosis)
+    parts = {"forms": tuple(verdicts), "ranking": tuple(verdicts), "significance": 0.01}
+    for name, value in parts.items():
+        object.__setattr__(diagnosis, name, value)
+    found = suspected(diagnosis)
+    assert found[0] is gap
+    assert [(e.joint, float(e.limit)) for e in found[1:]] == [(1, 8.0)]
+
+
 def test_a_late_drive_may_be_a_soft_joint(offset_case):
     asked = search_of(offset_case).asked
     soft, late = JointElasticity(joint=2, compliance=1e-3), TimeDelay(joint=2, delay=0.01)
@@ -370,6 +393,8 @@ def test_a_search_that_may_add_nothing_says_that_something_is_left(offset_case):
     found = jaxid.discover(jaxid.scara(), fit, held_out, most=0, progress=False)
     assert found.unfinished
     assert len(found.steps) == 1
+    assert found.verdict == "undetermined"
+    assert "stopped at the limit of 0 effects" in found.reason
     assert "lacks an effect, but none was to be added" in found.sentence
 
 
@@ -392,7 +417,8 @@ def test_a_load_that_drives_the_axis_into_its_limit_is_found():
     """
     load = fx.Payload(3.4137, 0.3, ("fit_2",))
     case = sim.make_case(1817948849, [load], noise="strong", robot="axis")
-    found = jaxid.discover(jaxid.emps(), *recordings_of(case), progress=False)
+    few = [Payload, TorqueOffset, Spring, TimeDelay, TorqueSaturation]
+    found = jaxid.discover(jaxid.emps(), *recordings_of(case), catalogue=few, progress=False)
     place = found.fit.names.index("payload")
     assert abs(found.fit.theta[place] - load.mass) < 4 * found.fit.std[place]
     assert found.loop.effects[-1].recordings == load.recordings
@@ -408,7 +434,8 @@ def test_a_gap_that_is_wider_than_its_signatures_is_found():
     """The best signature of a gap explains 0.2 %, and all others less than they cost."""
     gap = fx.Backlash(2, 0.12253, 0.0043017, 103.408, 3.0)
     case = sim.make_case(1157893421, [gap], noise="white", robot="two_link")
-    found = jaxid.discover(_two_link(case), *recordings_of(case), progress=False)
+    few = [Backlash, JointElasticity, Hysteresis, TorqueOffset, Spring]
+    found = jaxid.discover(_two_link(case), *recordings_of(case), catalogue=few, progress=False)
     assert [(a["effect"], a["joint"]) for a in found.to_dict()["added"]] == [("backlash", 2)]
     place = found.fit.names.index("gap2")
     assert abs(found.fit.theta[place] - gap.gap) < 4 * found.fit.std[place]
@@ -420,7 +447,8 @@ def test_two_large_effects_are_fitted_one_after_the_other():
     ripple = fx.TorqueRipple(1, -0.093813, -0.221357, 4.0)
     tilt = fx.Gravity(0.0, 0.2, 0.369468)
     case = sim.make_case(1365823038, [ripple, tilt], noise="moderate", robot="two_link")
-    found = jaxid.discover(_two_link(case), *recordings_of(case), progress=False)
+    few = [Gravity, TorqueRipple, EncoderEccentricity, TorqueOffset, Spring]
+    found = jaxid.discover(_two_link(case), *recordings_of(case), catalogue=few, progress=False)
     assert {a["effect"] for a in found.to_dict()["added"]} == {"gravity", "torque_ripple"}
     assert found.verdict == "explained"
 

@@ -144,8 +144,10 @@ def _told(
     steps = _tested(search, _steps(search, models))
     models = _held_out(search, models, steps)
     reason = _STOPPED if interrupted else _raised(search, steps)
-    if not unfinished and not reason:
+    if not reason:
         reason = _doubt(search, verdict, steps)
+        if unfinished and reason and steps[-1].fit.status is Status.converged:
+            reason = _stopped_short(search.asked.most)
     if (reason and not interrupted) or verdict == "outside_catalogue":
         # Probabilities assume that one of the examined models is right.
         steps = [s if s.added is None else dataclasses.replace(s, probability=None) for s in steps]
@@ -165,6 +167,14 @@ def _told(
         seconds=time.perf_counter() - started,
         unfinished=unfinished,
         interrupted=interrupted,
+    )
+
+
+def _stopped_short(most: int) -> str:
+    """The reason if a model with the largest number of effects fails a test."""
+    return (
+        f"a further effect would lower the error, and the search stopped at the limit of {most} "
+        f"effect{'s' * (most != 1)}: raise most; many effects together may approximate another law"
     )
 
 

@@ -53,7 +53,7 @@ def replaced(search: Examined, at: Model) -> Model | None:
 
 
 def with_transmission(search: Examined, at: Model) -> Model | None:
-    """The best fit with a transmission of which predictions explain too little, if it is better."""
+    """The best fit with a transmission or limit that predictions underrate, if it is better."""
     assert at.fit is not None
     full, best = len(at.effects) >= search.asked.most, at
     if full or imposed(at.fit.loop) or at.key not in search.diagnoses:

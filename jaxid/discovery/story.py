@@ -106,14 +106,14 @@ class Discovery(AbstractShown):
         if self.interrupted:
             so_far = f"adds {added}" if added else "is the starting model"
             return f"The search was interrupted: the best model until then {so_far}."
+        if self.unfinished and not added:
+            return f"The model of {self.loop.name} lacks an effect, but none was to be added."
         if self.verdict == "undetermined":
             best = f"the best model adds {added}, but " if added else ""
             return (
                 f"These recordings do not tell what the model of {self.loop.name} lacks: "
                 f"{best}{self.reason}."
             )
-        if self.unfinished and not added:
-            return f"The model of {self.loop.name} lacks an effect, but none was to be added."
         if self.verdict == "adequate":
             return (
                 f"The model of {self.loop.name} describes these recordings down to their noise: "

@@ -1,32 +1,41 @@
-"""Transmissions that may explain a motion although their signatures do not."""
+"""Transmissions and limits that may explain a motion although their signatures do not."""
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..effects import AbstractEffect, AbstractTransmission, ActuatorLag, TimeDelay
+from ..effects import AbstractEffect, AbstractTransmission, ActuatorLag, TimeDelay, TorqueSaturation
 from .asked import Asked
 from .diagnosis import Diagnosis
 
+# Ratio of the limit that is fitted to the screened one.
+_LOWER = 0.8
+
 
 def suspected(diagnosis: Diagnosis) -> tuple[AbstractEffect, ...]:
-    """Transmissions on the joints where one is significant, each at its best setting.
+    """Transmissions and limits on the joints where one of them is significant, at a good setting.
 
-    A wide gap or a soft joint changes the motion so much that signatures, which are simulated with
-    small gaps and compliances, resemble the residual only a little. They are significant, but
-    explain too little to be fitted.
+    A wide gap, a soft joint or a limit that acts for long changes the motion so much that
+    signatures, which are simulated with small gaps, small compliances and high limits, resemble the
+    residual only a little. They are significant, but explain too little to be fitted.
     """
-    transmissions = [
-        v for v in diagnosis.forms if isinstance(v.hypothesis.effect, AbstractTransmission)
-    ]
-    loose = {
-        v.hypothesis.joint
-        for v in diagnosis.ranking
-        if isinstance(v.hypothesis.effect, AbstractTransmission)
-        and v.p_value < diagnosis.significance
-    }
-    return tuple(v.hypothesis.effect for v in transmissions if v.hypothesis.joint in loose)
+    found = []
+    for kind in (AbstractTransmission, TorqueSaturation):
+        loose = {
+            v.hypothesis.joint
+            for v in diagnosis.ranking
+            if isinstance(v.hypothesis.effect, kind) and v.p_value < diagnosis.significance
+        }
+        effects = [v.hypothesis.effect for v in diagnosis.forms]
+        found += [e for e in effects if isinstance(e, kind) and e.joint in loose]
+    return tuple(_acting(e) if isinstance(e, TorqueSaturation) else e for e in found)
+
+
+def _acting(effect: TorqueSaturation) -> TorqueSaturation:
+    """A lower limit. One that hardly acts has a slope of almost zero, and its fit ends there."""
+    return dataclasses.replace(effect, limit=_LOWER * effect.limit)
 
 
 def similar_ones(

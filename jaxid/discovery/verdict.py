@@ -13,6 +13,7 @@ from ..estimate.result import DOUBTFUL_PERCENT, joint_columns
 from ..noise import ARFilter
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
+from .episodes import in_episodes
 from .explore import DECISIVE
 from .floor import SPOKEN, Floor, floor_of
 from .hypotheses import effect_on
@@ -156,6 +157,7 @@ def refuted(
         or _apart_in_time(chosen, diagnosis, worth)
         or _above_floor(chosen, diagnosis, worth)
         or _above_measured(chosen, diagnosis.measured, worth)
+        or in_episodes(chosen, worth)
     )
     if held_out is None or reason:
         return reason
