@@ -27,6 +27,7 @@ from jaxid.discovery.score import Data
 from jaxid.discovery.search import Search, _lost
 from jaxid.discovery.signs import of_one_sign
 from jaxid.discovery.transmissions import similar_ones, suspected
+from jaxid.discovery.verify import Refits
 from jaxid.effects import (
     AbstractEffect,
     Backlash,
@@ -46,6 +47,8 @@ from jaxid.effects import (
     TorqueSaturation,
     on_joint,
 )
+from jaxid.estimate import SeparablePEM
+from jaxid.noise import ARFilter
 from jaxid.parameters import Scalar, parameter
 
 
@@ -546,3 +549,22 @@ def test_a_fit_that_does_not_converge_and_is_worse_has_lost_its_minimum(offset_s
     assert _lost(Model((), 1.0, fit=stopped), at)
     assert not _lost(Model((), 1.0, fit=fit), at)
     assert not _lost(Model((), -1.0, fit=stopped), at)
+
+
+@pytest.mark.slow
+def test_a_filter_does_not_hide_a_wrong_initial_state():
+    """An eccentric encoder starts beside the reference; a filter ignores rows after the start."""
+    case = sim.make_case(1554, [fx.EncoderEccentricity(2, 0.09, 4.66)], noise="white")
+    refits = Refits(recordings_of(case)[0], jaxid.OEM())
+    loop = jaxid.scara().add(EncoderEccentricity(joint=2))
+    white = refits.first(loop)
+    slow = np.array([0.149, 0.1035, 0.0783, 0.062, 0.0445, 0.0405, 0.0444, 0.0648])
+    powers = np.var(white.residuals[0], axis=0).tolist()
+    noise = (ARFilter(np.zeros(0), powers[0]), ARFilter(-slow, powers[1]))
+    ignored = jaxid.fit(white.loop, refits.recordings, SeparablePEM(refits.given(), filters=noise))
+    for r in ignored.residuals:
+        assert np.sqrt(np.mean(r[:8, 1] ** 2)) > 3 * np.std(r[50:, 1])
+    found = refits.filtered(white.loop, noise)
+    for r in found.residuals:
+        assert np.sqrt(np.mean(r[:8, 1] ** 2)) < 2 * np.std(r[50:, 1])
+    np.testing.assert_allclose(found.error_percent, white.error_percent, rtol=0.01)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Float
 
 from ..effects import AbstractEffect, AbstractTransmission
 from ..estimate import OEM, Fit, SeparablePEM, Status, fit
@@ -13,7 +14,7 @@ from ..parameters import Bounds, read_values, write_values
 from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
 from .hypotheses import free_of
-from .likelihood import score_of
+from .likelihood import noise_filters, score_of
 from .signs import of_one_sign, reshaped
 
 # Factor on the gap at the start of another refit. In a wide gap the link moves freely for longer,
@@ -25,6 +26,8 @@ _CERTAIN, _RESHAPED = 3.0, 10.0
 # Ratio of actual to predicted decrease of the score above which, or below whose inverse, the refit
 # is repeated from another start.
 _FAR = 2.0
+# Ratio of a residual after the start to the later one above which the initial state is wrong.
+_APART = 3.0
 
 
 class Refits(eqx.Module):
@@ -38,9 +41,20 @@ class Refits(eqx.Module):
         return fit(loop, self.recordings, quiet(self.method))
 
     def filtered(self, loop: ClosedLoop, noise: Sequence[ARFilter]) -> Fit:
-        """A fit with noise filters, from the loop's values; efficient for coloured noise."""
-        method = SeparablePEM(self.given(), filters=tuple(noise))
-        return fit(loop, self.recordings, method)
+        """A fit with noise filters, from the loop's values; efficient for coloured noise.
+
+        A filter ignores as many rows after the start as its order. If the residual is large there,
+        the initial state is wrong, and the filter may model how it decays. The fit is then repeated
+        from one without filters.
+        """
+        found = fit(loop, self.recordings, SeparablePEM(self.given(), filters=tuple(noise)))
+        if not found.status.simulated or not _starts_apart(found.residuals, noise):
+            return found
+        plain = self.unfiltered(found.loop, noise)
+        if not plain.status.simulated:
+            return found
+        own = SeparablePEM(self.given(), filters=noise_filters(plain.residuals))
+        return self.best([found, fit(plain.loop, self.recordings, own)])
 
     def given(self) -> OEM:
         """The output-error method that starts from the loop's values."""
@@ -147,6 +161,18 @@ def _inside(effect: AbstractEffect) -> AbstractEffect:
         return effect
     values = Bounds.of(chosen).moved_inside(read_values(effect, chosen))
     return write_values(effect, chosen, values)
+
+
+def _starts_apart(
+    residuals: Sequence[Float[np.ndarray, "_samples outputs"]], noise: Sequence[ARFilter]
+) -> bool:
+    """Whether residuals are much larger in the first rows, which filters ignore, than later."""
+    for rest in residuals:
+        for output, filt in zip(rest.T, noise, strict=True):
+            first, later = output[: filt.order] ** 2, output[filt.order :] ** 2
+            if len(first) and first.mean() > _APART**2 * later.mean():
+                return True
+    return False
 
 
 def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
