@@ -19,7 +19,7 @@ from jaxid.discovery.diagnosis import Diagnosis
 from jaxid.discovery.explore import Candidate, _fitted, _plain, key_of
 from jaxid.discovery.hypotheses import Hypothesis
 from jaxid.discovery.landscape import Entry, shares_a_joint
-from jaxid.discovery.last_tries import replaced
+from jaxid.discovery.last_tries import replaced, with_transmission
 from jaxid.discovery.likelihood import price, score, weights
 from jaxid.discovery.loose import undetermined, with_fewer, without_loose
 from jaxid.discovery.models import Model, Visited, probability
@@ -27,7 +27,7 @@ from jaxid.discovery.score import Data
 from jaxid.discovery.search import Search, _lost
 from jaxid.discovery.signs import of_one_sign
 from jaxid.discovery.transmissions import similar_ones, suspected
-from jaxid.discovery.verify import Refits
+from jaxid.discovery.verify import Refits, held_shapes
 from jaxid.effects import (
     AbstractEffect,
     Backlash,
@@ -270,6 +270,19 @@ def test_a_fitted_elasticity_may_be_a_gap(offset_case):
     load = np.sqrt(np.mean(np.concatenate([r.tau[:, 1] for r in asked.recordings]) ** 2))
     assert float(gap.gap) == pytest.approx(2e-3 * load)
     assert list(similar_ones((gap,), asked, ())) == []
+    # A gap that is narrower than the twist may be none.
+    ((_, again),) = similar_ones((gap.scaled(0.1),), asked, ())
+    assert isinstance(again, JointElasticity)
+    np.testing.assert_allclose([again.compliance, again.rotor], [1e-3, 0.1])
+
+
+def diagnosis_of(*verdicts) -> Diagnosis:
+    """One with these verdicts on effects, and on no curve."""
+    found = object.__new__(Diagnosis)
+    parts = {"forms": verdicts, "ranking": verdicts, "where": (), "significance": 0.01}
+    for name, value in parts.items():
+        object.__setattr__(found, name, value)
+    return found
 
 
 def test_a_significant_limit_is_fitted_from_one_that_acts():
@@ -280,11 +293,7 @@ def test_a_significant_limit_is_fitted_from_one_that_acts():
         SimpleNamespace(hypothesis=SimpleNamespace(effect=e, joint=e.joint), p_value=p)
         for e, p in zip((*limits, gap), (1e-6, 0.5, 1e-6), strict=True)
     ]
-    diagnosis = object.__new__(Diagnosis)
-    parts = {"forms": tuple(verdicts), "ranking": tuple(verdicts), "significance": 0.01}
-    for name, value in parts.items():
-        object.__setattr__(diagnosis, name, value)
-    found = suspected(diagnosis)
+    found = suspected(diagnosis_of(*verdicts))
     assert found[0] is gap
     assert [(e.joint, float(e.limit)) for e in found[1:]] == [(1, 8.0)]
 
@@ -568,3 +577,24 @@ def test_a_filter_does_not_hide_a_wrong_initial_state():
     for r in found.residuals:
         assert np.sqrt(np.mean(r[:8, 1] ** 2)) < 2 * np.std(r[50:, 1])
     np.testing.assert_allclose(found.error_percent, white.error_percent, rtol=0.01)
+
+
+@pytest.mark.slow
+def test_an_elasticity_takes_the_place_of_a_narrow_gap():
+    """A gap of the size of its deviation in a soft contact describes an elasticity as well."""
+    soft = fx.JointElasticity(1, 0.031, 0.023, 0.001)
+    case = sim.make_case(1511254360, [soft], noise="white", robot="two_link")
+    search = search_of(case)
+    search.visit((), search.fits.start(_two_link(case)))
+    start = search.visited.fitted(())
+    gap = Backlash(joint=1, gap=1e-4, rotor=0.023, stiffness=32.0, damping=0.004)
+    loop = start.fit.loop.add(gap)
+    loop = loop.free(*held_shapes(loop, 1))
+    last = jaxid.fit(loop, search.asked.recordings, jaxid.OEM(start="given"))
+    at = search.visit(search.added(last), last)
+    search.diagnoses = {at.key: diagnosis_of()}
+    found = with_transmission(search, at)
+    assert found.names == (("joint_elasticity", 1),)
+    assert found.score < at.score - 6
+    value, std = (x[found.fit.names.index("compliance1")] for x in (found.fit.theta, found.fit.std))
+    assert abs(value - soft.compliance) < 4 * std

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from ..effects import AbstractEffect, AsymmetricFriction
+from ..effects import AbstractEffect, AsymmetricFriction, Backlash
 from ..errors import FitError, ModelError
 from ..estimate import Fit
 from ..noise import ARFilter
@@ -62,14 +62,15 @@ def with_transmission(search: Examined, at: Model) -> Model | None:
     for effect in suspected(diagnosis):
         if search.visited.fitted((*at.effects, effect)) is None:
             best = _better(search, best, (effect,), _added(search, at, effect, at.noise))
-    if diagnosis.depends_on():
-        # Each of them may only resemble a transmission.
-        screened = [v.hypothesis.effect for v in diagnosis.forms]
-        for effect, similar in similar_ones(at.effects, search.asked, screened):
-            rest = tuple(e for e in at.effects if e is not effect)
-            if search.visited.fitted((*rest, similar)) is None:
-                less = search.had(at, rest) or search.refitted(at, rest)
-                best = _better(search, best, (similar,), _added(search, less, similar, at.noise))
+    left, screened = diagnosis.depends_on(), [v.hypothesis.effect for v in diagnosis.forms]
+    for effect, similar in similar_ones(at.effects, search.asked, screened):
+        # An elasticity is simpler than a gap; it may be better if nothing is left.
+        if not left and not isinstance(effect, Backlash):
+            continue
+        rest = tuple(e for e in at.effects if e is not effect)
+        if search.visited.fitted((*rest, similar)) is None:
+            less = search.had(at, rest) or search.refitted(at, rest)
+            best = _better(search, best, (similar,), _added(search, less, similar, at.noise))
     return best if best.score < at.score - LIKELY else None
 
 

@@ -44,6 +44,12 @@ class JointElasticity(AbstractTransmission):
         """The compliance times a factor."""
         return dataclasses.replace(self, compliance=self.compliance * factor)
 
+    def after(self, other: AbstractTransmission, load: float) -> "JointElasticity | None":
+        """An elasticity as stiff as the contact, if its twist under load is wider than the gap."""
+        if not isinstance(other, Backlash) or other.gap * other.stiffness > load:
+            return None
+        return dataclasses.replace(self, compliance=1 / other.stiffness, rotor=other.rotor)
+
     def present(self) -> Bool[Array, ""]:
         """Whether the compliance is above zero."""
         return self.compliance > 0
