@@ -86,6 +86,11 @@ def with_chain(case: sim.Case, start: Step, *effects: AbstractEffect) -> list[St
     return steps
 
 
+def two_link_of(case: sim.Case) -> jaxid.ClosedLoop:
+    """The two-link arm with the law of a case."""
+    return jaxid.two_link(jaxid.control.PD(**dataclasses.asdict(case.controller)))
+
+
 def search_of(case: sim.Case) -> Search:
     """A search that keeps nothing, before its start."""
     fit, held_out = recordings_of(case)

@@ -11,40 +11,33 @@ import numpy as np
 import pytest
 import scipy
 from independent import effects as fx
-from stories import recordings_of, search_of, with_chain
+from stories import recordings_of, search_of, two_link_of, with_chain
 
 import jaxid
 from jaxid.discovery.bounded import bounded_amplitudes
-from jaxid.discovery.diagnosis import Diagnosis
 from jaxid.discovery.explore import Candidate, _fitted, _plain, key_of
 from jaxid.discovery.hypotheses import Hypothesis
 from jaxid.discovery.landscape import Entry, shares_a_joint
-from jaxid.discovery.last_tries import replaced, with_transmission
 from jaxid.discovery.likelihood import price, score, weights
 from jaxid.discovery.loose import undetermined, with_fewer, without_loose
 from jaxid.discovery.models import Model, Visited, probability
 from jaxid.discovery.score import Data
 from jaxid.discovery.search import Search, _lost
 from jaxid.discovery.signs import of_one_sign
-from jaxid.discovery.transmissions import similar_ones, suspected
-from jaxid.discovery.verify import Refits, held_shapes
+from jaxid.discovery.verify import Refits
 from jaxid.effects import (
     AbstractEffect,
     Backlash,
     EncoderEccentricity,
     Gravity,
-    Hysteresis,
     JointElasticity,
     Motion,
-    Payload,
     QuadraticDrag,
     RotorInertia,
     Spring,
     Stribeck,
-    TimeDelay,
     TorqueOffset,
     TorqueRipple,
-    TorqueSaturation,
     on_joint,
 )
 from jaxid.estimate import SeparablePEM
@@ -241,72 +234,6 @@ def test_a_set_without_support_is_no_rival(offset_case, offset_story, monkeypatc
 
 
 @pytest.mark.xdist_group("offset")
-def test_a_close_rival_that_was_only_predicted_is_fitted(offset_case, offset_story):
-    """A weak spring in the place of the offset; the prediction puts the offset slightly behind."""
-    search, start = search_of(offset_case), offset_story[0].steps[0]
-    search.visit((), start.fit)
-    last = with_chain(offset_case, start, Spring(joint=2, stiffness=0.01))[-1].fit
-    at = search.visit(search.added(last), last)
-    offset = (TorqueOffset(joint=2, level=0.01),)
-    search.visited.add(Model(offset, at.score + 20.0, noise=at.noise, beyond=1))
-    assert replaced(search, at) is None
-    search.visited.add(Model(offset, at.score + 5.0, noise=at.noise, beyond=1))
-    found = replaced(search, at)
-    assert found is not None
-    assert found.names == (("torque_offset", 2),)
-    assert found.score < at.score - 5
-    # It was fitted, so it is not tried again.
-    assert replaced(search, found) is None
-
-
-def test_a_fitted_elasticity_may_be_a_gap(offset_case):
-    asked = search_of(offset_case).asked
-    soft = JointElasticity(joint=2, compliance=1e-3, rotor=0.1)
-    ((effect, gap),) = similar_ones((TorqueOffset(joint=1), soft), asked, ())
-    assert effect is soft
-    assert isinstance(gap, Backlash)
-    assert (gap.joint, float(gap.rotor)) == (2, 0.1)
-    assert float(gap.stiffness) == pytest.approx(1e3)
-    load = np.sqrt(np.mean(np.concatenate([r.tau[:, 1] for r in asked.recordings]) ** 2))
-    assert float(gap.gap) == pytest.approx(2e-3 * load)
-    assert list(similar_ones((gap,), asked, ())) == []
-    # A gap that is narrower than the twist may be none.
-    ((_, again),) = similar_ones((gap.scaled(0.1),), asked, ())
-    assert isinstance(again, JointElasticity)
-    np.testing.assert_allclose([again.compliance, again.rotor], [1e-3, 0.1])
-
-
-def diagnosis_of(*verdicts) -> Diagnosis:
-    """One with these verdicts on effects, and on no curve."""
-    found = object.__new__(Diagnosis)
-    parts = {"forms": verdicts, "ranking": verdicts, "where": (), "significance": 0.01}
-    for name, value in parts.items():
-        object.__setattr__(found, name, value)
-    return found
-
-
-def test_a_significant_limit_is_fitted_from_one_that_acts():
-    """Screened limits of the other joint are not significant."""
-    limits = [TorqueSaturation(joint=j, limit=10.0) for j in (1, 2)]
-    gap = Backlash(joint=1, gap=0.1)
-    verdicts = [
-        SimpleNamespace(hypothesis=SimpleNamespace(effect=e, joint=e.joint), p_value=p)
-        for e, p in zip((*limits, gap), (1e-6, 0.5, 1e-6), strict=True)
-    ]
-    found = suspected(diagnosis_of(*verdicts))
-    assert found[0] is gap
-    assert [(e.joint, float(e.limit)) for e in found[1:]] == [(1, 8.0)]
-
-
-def test_a_late_drive_may_be_a_soft_joint(offset_case):
-    asked = search_of(offset_case).asked
-    soft, late = JointElasticity(joint=2, compliance=1e-3), TimeDelay(joint=2, delay=0.01)
-    screened = (soft, JointElasticity(joint=1), Spring(joint=2))
-    pairs = similar_ones((late, TorqueOffset(joint=2)), asked, screened)
-    assert [(id(a), id(b)) for a, b in pairs] == [(id(late), id(soft))]
-
-
-@pytest.mark.xdist_group("offset")
 def test_every_added_effect_must_be_determined(offset_case, offset_story):
     start = offset_story[0].steps[0]
     fit = with_chain(offset_case, start, TorqueOffset(joint=2), QuadraticDrag(joint=1))[-1].fit
@@ -422,45 +349,13 @@ def test_effects_share_the_sharpness_that_is_estimated_for_their_joint():
 
 
 @pytest.mark.slow
-def test_a_load_that_drives_the_axis_into_its_limit_is_found():
-    """Its signature predicts an eighth of it, and filters of that prediction prevent convergence.
-
-    The drive is at the controller's limit in both recordings, in the loaded one for longer.
-    """
-    load = fx.Payload(3.4137, 0.3, ("fit_2",))
-    case = sim.make_case(1817948849, [load], noise="strong", robot="axis")
-    few = [Payload, TorqueOffset, Spring, TimeDelay, TorqueSaturation]
-    found = jaxid.discover(jaxid.emps(), *recordings_of(case), catalogue=few, progress=False)
-    place = found.fit.names.index("payload")
-    assert abs(found.fit.theta[place] - load.mass) < 4 * found.fit.std[place]
-    assert found.loop.effects[-1].recordings == load.recordings
-
-
-def _two_link(case):
-    law = jaxid.control.PD(**dataclasses.asdict(case.controller))
-    return jaxid.two_link(law)
-
-
-@pytest.mark.slow
-def test_a_gap_that_is_wider_than_its_signatures_is_found():
-    """The best signature of a gap explains 0.2 %, and all others less than they cost."""
-    gap = fx.Backlash(2, 0.12253, 0.0043017, 103.408, 3.0)
-    case = sim.make_case(1157893421, [gap], noise="white", robot="two_link")
-    few = [Backlash, JointElasticity, Hysteresis, TorqueOffset, Spring]
-    found = jaxid.discover(_two_link(case), *recordings_of(case), catalogue=few, progress=False)
-    assert [(a["effect"], a["joint"]) for a in found.to_dict()["added"]] == [("backlash", 2)]
-    place = found.fit.names.index("gap2")
-    assert abs(found.fit.theta[place] - gap.gap) < 4 * found.fit.std[place]
-
-
-@pytest.mark.slow
 def test_two_large_effects_are_fitted_one_after_the_other():
     """A fit of both at once, from their predicted values, does not converge."""
     ripple = fx.TorqueRipple(1, -0.093813, -0.221357, 4.0)
     tilt = fx.Gravity(0.0, 0.2, 0.369468)
     case = sim.make_case(1365823038, [ripple, tilt], noise="moderate", robot="two_link")
     few = [Gravity, TorqueRipple, EncoderEccentricity, TorqueOffset, Spring]
-    found = jaxid.discover(_two_link(case), *recordings_of(case), catalogue=few, progress=False)
+    found = jaxid.discover(two_link_of(case), *recordings_of(case), catalogue=few, progress=False)
     assert {a["effect"] for a in found.to_dict()["added"]} == {"gravity", "torque_ripple"}
     assert found.verdict == "explained"
 
@@ -577,24 +472,3 @@ def test_a_filter_does_not_hide_a_wrong_initial_state():
     for r in found.residuals:
         assert np.sqrt(np.mean(r[:8, 1] ** 2)) < 2 * np.std(r[50:, 1])
     np.testing.assert_allclose(found.error_percent, white.error_percent, rtol=0.01)
-
-
-@pytest.mark.slow
-def test_an_elasticity_takes_the_place_of_a_narrow_gap():
-    """A gap of the size of its deviation in a soft contact describes an elasticity as well."""
-    soft = fx.JointElasticity(1, 0.031, 0.023, 0.001)
-    case = sim.make_case(1511254360, [soft], noise="white", robot="two_link")
-    search = search_of(case)
-    search.visit((), search.fits.start(_two_link(case)))
-    start = search.visited.fitted(())
-    gap = Backlash(joint=1, gap=1e-4, rotor=0.023, stiffness=32.0, damping=0.004)
-    loop = start.fit.loop.add(gap)
-    loop = loop.free(*held_shapes(loop, 1))
-    last = jaxid.fit(loop, search.asked.recordings, jaxid.OEM(start="given"))
-    at = search.visit(search.added(last), last)
-    search.diagnoses = {at.key: diagnosis_of()}
-    found = with_transmission(search, at)
-    assert found.names == (("joint_elasticity", 1),)
-    assert found.score < at.score - 6
-    value, std = (x[found.fit.names.index("compliance1")] for x in (found.fit.theta, found.fit.std))
-    assert abs(value - soft.compliance) < 4 * std
