@@ -16,9 +16,7 @@ from jaxid.discovery.transmissions import similar_ones, suspected
 from jaxid.discovery.verify import held_shapes
 from jaxid.effects import (
     Backlash,
-    Hysteresis,
     JointElasticity,
-    Payload,
     Spring,
     TimeDelay,
     TorqueOffset,
@@ -75,8 +73,7 @@ def test_a_load_that_drives_the_axis_into_its_limit_is_found():
     """
     load = fx.Payload(3.4137, 0.3, ("fit_2",))
     case = sim.make_case(1817948849, [load], noise="strong", robot="axis")
-    few = [Payload, TorqueOffset, Spring, TimeDelay, TorqueSaturation]
-    found = jaxid.discover(jaxid.emps(), *recordings_of(case), catalogue=few, progress=False)
+    found = jaxid.discover(jaxid.emps(), *recordings_of(case), progress=False)
     place = found.fit.names.index("payload")
     assert abs(found.fit.theta[place] - load.mass) < 4 * found.fit.std[place]
     assert found.loop.effects[-1].recordings == load.recordings
@@ -87,8 +84,7 @@ def test_a_gap_that_is_wider_than_its_signatures_is_found():
     """The best signature of a gap explains 0.2 %, and all others less than they cost."""
     gap = fx.Backlash(2, 0.12253, 0.0043017, 103.408, 3.0)
     case = sim.make_case(1157893421, [gap], noise="white", robot="two_link")
-    few = [Backlash, JointElasticity, Hysteresis, TorqueOffset, Spring]
-    found = jaxid.discover(two_link_of(case), *recordings_of(case), catalogue=few, progress=False)
+    found = jaxid.discover(two_link_of(case), *recordings_of(case), progress=False)
     assert [(a["effect"], a["joint"]) for a in found.to_dict()["added"]] == [("backlash", 2)]
     place = found.fit.names.index("gap2")
     assert abs(found.fit.theta[place] - gap.gap) < 4 * found.fit.std[place]

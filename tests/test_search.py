@@ -29,7 +29,6 @@ from jaxid.effects import (
     AbstractEffect,
     Backlash,
     EncoderEccentricity,
-    Gravity,
     JointElasticity,
     Motion,
     QuadraticDrag,
@@ -354,8 +353,7 @@ def test_two_large_effects_are_fitted_one_after_the_other():
     ripple = fx.TorqueRipple(1, -0.093813, -0.221357, 4.0)
     tilt = fx.Gravity(0.0, 0.2, 0.369468)
     case = sim.make_case(1365823038, [ripple, tilt], noise="moderate", robot="two_link")
-    few = [Gravity, TorqueRipple, EncoderEccentricity, TorqueOffset, Spring]
-    found = jaxid.discover(two_link_of(case), *recordings_of(case), catalogue=few, progress=False)
+    found = jaxid.discover(two_link_of(case), *recordings_of(case), progress=False)
     assert {a["effect"] for a in found.to_dict()["added"]} == {"gravity", "torque_ripple"}
     assert found.verdict == "explained"
 

@@ -44,8 +44,8 @@ def similar_ones(
     """The fitted effects that may only resemble a transmission, each with that transmission.
 
     An elasticity resembles a gap as wide as its twist under load, and a gap that is narrower than
-    the twist an elasticity. A soft joint, beyond what
-    screening simulates, first resembles a late drive.
+    the twist an elasticity. A soft joint, beyond what screening simulates, first resembles a late
+    drive.
 
     **Arguments:**
 
