@@ -188,13 +188,32 @@ def bare(urdf: str) -> Plant:
 
 
 @dataclass(frozen=True)
+class Law:
+    """PD with an integral at 1 kHz on encoders; vectors are `(joints,)`.
+
+    The velocity is the difference of readings after a first-order low-pass, `cutoff` in Hz. `hold`
+    is a constant torque, N·m, which holds the arm at its start.
+    """
+
+    Kp: np.ndarray
+    Ki: np.ndarray
+    Kd: np.ndarray
+    hold: np.ndarray
+    resolution: float
+    cutoff: float = 150.0
+
+
+@dataclass(frozen=True)
 class Run:
-    """At 1 kHz, `(ticks, joints)`: encoders, commanded torque, and torque of the hidden effects."""
+    """At 1 kHz, `(ticks, joints)`: encoders, reference, commanded torque, and torque of the hidden
+    effects; and the law."""
 
     time: np.ndarray
     q: np.ndarray
+    q_ref: np.ndarray
     tau: np.ndarray
     taken: np.ndarray
+    law: Law
 
 
 def simulate(
@@ -212,12 +231,12 @@ def simulate(
     mujoco.mj_forward(model, data)
     n = model.nv
     m = inertias(model, data)
-    kp, kd, ki = m * bandwidth**2, 1.4 * m * bandwidth, 0.3 * m * bandwidth**3
-    # It begins with the torque that holds the arm.
-    integral = np.array(data.qfrc_bias) / ki
+    hold = np.array(data.qfrc_bias)
+    law = Law(m * bandwidth**2, 0.3 * m * bandwidth**3, 1.4 * m * bandwidth, hold, resolution)
+    integral = np.zeros(n)
     before, speed = np.round(home / resolution) * resolution, np.zeros(n)
-    smooth = 1.0 - math.exp(-2 * math.pi * 150.0 * TICK)
-    rows: dict[str, list[np.ndarray]] = {"q": [], "tau": [], "taken": []}
+    smooth = 1.0 - math.exp(-2 * math.pi * law.cutoff * TICK)
+    rows: dict[str, list[np.ndarray]] = {"q": [], "q_ref": [], "tau": [], "taken": []}
     taken, through = [0.0] * n, np.array(data.qfrc_bias).tolist()
     ticks = round(duration / TICK)
     for k in range(ticks):
@@ -225,9 +244,11 @@ def simulate(
         asked, ahead = (home + np.array(reference.at((k + i) * TICK)) for i in (0, 1))
         speed = speed + smooth * ((q - before) / TICK - speed)
         integral = integral + (asked - q) * TICK
-        tau = kp * (asked - q) + ki * integral + kd * ((ahead - asked) / TICK - speed)
+        tau = hold + law.Kp * (asked - q) + law.Ki * integral
+        tau = tau + law.Kd * ((ahead - asked) / TICK - speed)
         before = q
         rows["q"].append(q)
+        rows["q_ref"].append(asked)
         rows["tau"].append(tau)
         rows["taken"].append(np.array(taken))
         for _ in range(STEPS):
@@ -243,7 +264,7 @@ def simulate(
     arrays = {name: np.array(row) for name, row in rows.items()}
     if not all(np.isfinite(x).all() for x in arrays.values()):
         raise ValueError("the simulation diverged")
-    return Run(np.arange(ticks) * TICK, **arrays)
+    return Run(np.arange(ticks) * TICK, **arrays, law=law)
 
 
 def inertias(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:

@@ -1,17 +1,18 @@
-"""Hidden effects on arms of six and seven joints under an unknown law.
+"""Hidden effects on arms of six and seven joints.
 
 Published URDFs (Universal Robots, Unitree Z1, Kinova, Panda without its fingers) are simulated by
 MuJoCo under a law that is computed at 1 kHz from quantised encoders. One effect is hidden, or none.
 The user has the URDF, the rotors' data sheet, two recordings of 10 s to fit and one to test, and
-does not know the law.
+does not know the law; or declares it as it is (`--law known`), with the torque that holds the arm
+at its start as a feed-forward.
 
 A body at the tip is a part of the last link. It can be identified on all recordings only if the
 links are held as drawn; if they are estimated, it is hidden in one recording only. Rotors and
 counterbalances would also be absorbed by estimated links, so they are hidden only with held links.
 Links that are estimated are drawn wrong by up to a fifth.
 
-python -m benchmarks.six_joints [--seed N] [--count 40] [--quick] [--jobs 1] [--out DIR]
-                                [--case N] [--json FILE]
+python -m benchmarks.six_joints [--seed N] [--count 40] [--law unknown] [--quick] [--jobs 1]
+                                [--out DIR] [--case N] [--json FILE]
 """
 
 import argparse
@@ -33,6 +34,8 @@ from jaxid.storage.campaign import Campaign, Failed
 
 from ._six_joints_world import (
     ROBOTS,
+    TICK,
+    Law,
     Plant,
     Run,
     arm_alone,
@@ -71,19 +74,24 @@ _FEW = jaxid.effects.CarriedBody, jaxid.effects.BaseTilt, jaxid.effects.Stribeck
 
 @dataclass(frozen=True)
 class Wanted:
-    """Specification of a case; no effect if it is clean. `few`: whether there are few."""
+    """Specification of a case; no effect if it is clean.
+
+    `law` is the user's knowledge of it. `few`: whether few effects are asked.
+    """
 
     number: int
     seed: int
     robot: str
     effect: str
     bodies: str
+    law: str = "unknown"
     few: bool = False
 
     @property
     def label(self) -> str:
         """Name in files and tables."""
-        return f"{self.number:03d}_{self.robot}_{self.bodies}_{self.effect or 'clean'}"
+        what = f"{self.robot}_{self.bodies}_{self.effect or 'clean'}"
+        return f"{self.number:03d}_{self.law}_{what}"
 
 
 @dataclass(frozen=True)
@@ -101,8 +109,8 @@ class Case:
     size: float
 
 
-def draw_wanted(master: int, count: int) -> list[Wanted]:
-    """`count` cases: one in five clean, the others with one effect."""
+def draw_wanted(master: int, count: int, law: str) -> list[Wanted]:
+    """`count` cases, the same for every law: one in five clean, the others with one effect."""
     rng = np.random.default_rng(master)
     found = []
     for number in range(count):
@@ -110,7 +118,7 @@ def draw_wanted(master: int, count: int) -> list[Wanted]:
         effect = "" if clean else str(rng.choice(EFFECTS))
         bodies = "drawn" if effect in OF_DRAWN else str(rng.choice(["drawn", "free"]))
         robot = str(rng.choice(list(ROBOTS)))
-        found.append(Wanted(number, int(rng.integers(1, 2**31)), robot, effect, bodies))
+        found.append(Wanted(number, int(rng.integers(1, 2**31)), robot, effect, bodies, law))
     return found
 
 
@@ -138,17 +146,35 @@ def make(wanted: Wanted) -> Case:
     sheet = list(plant.rotors)
     if wanted.effect == "rotor_inertia" and joint is not None:
         sheet[joint - 1] *= numbers["told"]
-    loop = _model(text(drawn), tip, sheet, wanted.bodies)
+    law = None if wanted.law == "unknown" else _declared(runs[0].law)
+    loop = _model(text(drawn), tip, law, sheet, wanted.bodies)
     recordings = tuple(
-        _recorded(rng, run, level, name) for run, name in zip(runs, NAMES, strict=True)
+        _recorded(rng, run, level, name, wanted.law) for run, name in zip(runs, NAMES, strict=True)
     )
     size = float(np.max([np.sqrt(np.mean(run.taken**2, axis=0)) / level for run in runs]))
     return Case(loop, recordings, joint, numbers, size)
 
 
-def _model(urdf: str, tip: str, rotors: Sequence[float], bodies: str) -> jaxid.ClosedLoop:
+def _declared(law: Law) -> jaxid.control.Sampled:
+    """The law as a user declares it."""
+    return jaxid.control.Sampled(
+        jaxid.control.PID(Kp=law.Kp, Ki=law.Ki, Kd=law.Kd),
+        every=TICK,
+        resolution=np.full(len(law.Kp), law.resolution),
+        velocity="difference",
+        cutoff=law.cutoff,
+    )
+
+
+def _model(
+    urdf: str,
+    tip: str,
+    law: jaxid.control.Sampled | None,
+    rotors: Sequence[float],
+    bodies: str,
+) -> jaxid.ClosedLoop:
     """The model of a user who assumes drives without offsets and the rotors of the data sheet."""
-    loop = jaxid.serial(urdf, rotors=rotors, bodies=bodies, tip=tip)
+    loop = jaxid.serial(urdf, law, rotors=rotors, bodies=bodies, tip=tip)
     for j in range(1, loop.joints + 1):
         loop = loop.without("torque_offset", j).hold(f"Ia{j}")
     return loop
@@ -266,12 +292,19 @@ def _numbers(
     return {}
 
 
-def _recorded(rng: np.random.Generator, run: Run, level: np.ndarray, name: str) -> jaxid.Recording:
-    """The logged run, with noise in its torque."""
+def _recorded(
+    rng: np.random.Generator, run: Run, level: np.ndarray, name: str, law: str
+) -> jaxid.Recording:
+    """The logged run, with noise in its torque; with the inputs of the law if it is known."""
     every = round(1000 / RATE)
     tau = run.tau[::every]
     noise = level * rng.standard_normal(tau.shape)
-    return jaxid.Recording.from_arrays(run.time[::every], run.q[::every], tau + noise, name=name)
+    inputs = {}
+    if law == "known":
+        inputs = {"q_ref": run.q_ref[::every], "tau_ff": np.broadcast_to(run.law.hold, tau.shape)}
+    return jaxid.Recording.from_arrays(
+        run.time[::every], run.q[::every], tau + noise, name=name, **inputs
+    )
 
 
 def run_case(wanted: Wanted) -> dict[str, Any]:
@@ -364,6 +397,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         help="one arm with a body at its tip, and few effects that are asked",
     )
     parser.add_argument("--count", type=int, default=40)
+    parser.add_argument("--law", choices=("unknown", "known"), default="unknown")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder in which a stopped run continues")
     parser.add_argument("--json", type=Path, help="file for all results")
@@ -371,16 +405,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     drawn = 1 if given.quick else secrets.randbits(31)
     seed = drawn if given.seed is None else given.seed
-    cases = draw_wanted(seed, given.count)
+    cases = draw_wanted(seed, given.count, given.law)
     cases = [w for w in cases if given.case is None or w.number in given.case]
     if given.quick:
-        cases = [Wanted(0, seed, "ur5", "payload", "drawn", few=True)]
+        cases = [Wanted(0, seed, "ur5", "payload", "drawn", given.law, few=True)]
     out = given.out or Path(tempfile.mkdtemp(prefix="six_joints_"))
-    print(f"seed {seed}, {len(cases)} cases, results in {out}", flush=True)
+    print(f"seed {seed}, law {given.law}, {len(cases)} cases, results in {out}", flush=True)
     configure_jax()
     records = []
     wanted = {case.label: case for case in cases}
-    with Campaign(out, {"seed": seed}) as campaign:
+    with Campaign(out, {"seed": seed, "law": given.law}) as campaign:
         for label, record in campaign.run(run_case, wanted, jobs=given.jobs):
             if isinstance(record, Failed):
                 record = {**asdict(wanted[label]), "error": record.reason}
@@ -390,7 +424,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, value in scores.items():
         print(f"  {name:48s}{value}")
     if given.json is not None:
-        content = {"seed": seed, "scores": scores, "cases": records}
+        content = {"seed": seed, "law": given.law, "scores": scores, "cases": records}
         given.json.write_text(json.dumps(content, indent=1, default=float) + "\n", encoding="utf-8")
 
 

@@ -101,3 +101,21 @@ def test_a_law_that_no_drive_computes_is_refused(law):
 def test_a_drive_without_a_period_is_refused():
     with pytest.raises(ModelError, match="give a period above zero"):
         Sampled(PD(Kp=1.0, Kv=1.0), every=0.0)
+
+
+def test_fits_do_not_round_readings():
+    fine = jaxid.control.Sampled(
+        jaxid.control.PD(Kp=[30.0], Kv=[2.0]), every=1e-3, resolution=[1e-3]
+    )
+    assert fine.rounds
+    fitted = fine.settled([])
+    assert not fitted.rounds
+    reading = jaxid.control.Reading(jnp.array([0.01234]), jnp.array([0.0]))
+    asked = jaxid.control.Reference(*jnp.zeros((4, 1)), {})
+    state = fine.initial_state(reading)
+    rounded, exact = (
+        law.command(reading, asked, law.tick(reading, asked, state), jnp.eye(1))
+        for law in (fine, fitted)
+    )
+    np.testing.assert_allclose(rounded, -30.0 * 0.012, rtol=1e-12)
+    np.testing.assert_allclose(exact, -30.0 * 0.01234, rtol=1e-12)

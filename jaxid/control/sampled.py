@@ -1,5 +1,7 @@
 """A continuous law in the form in which a drive computes it: sampled, with encoders and delay."""
 
+import dataclasses
+from collections.abc import Iterable
 from typing import Literal
 
 import equinox as eqx
@@ -25,12 +27,15 @@ class Sampled(AbstractController):
     - `law`: a continuous controller, with or without states.
     - `every`: period, s.
     - `delay`: number of periods after which a command acts.
-    - `resolution`: resolution of the encoders, rad or m, `(joints,)`; zero for exact readings. The
-      derivative of the rounding is set to one.
+    - `resolution`: resolution of the encoders, rad or m, `(joints,)`; zero for exact readings.
+      Simulations round the readings, fits do not: which way a reading is rounded depends on details
+      of the motion that no model reproduces, so the rounding of the robot is noise of its torque,
+      and that of a simulation would be further noise, which changes with every parameter.
     - `velocity`: `"measured"`, or the `"difference"` of readings `window` ticks apart.
     - `cutoff`: cutoff of a first-order low-pass on the velocity, Hz; None for no low-pass.
     - `limit`: largest torque, `(joints,)`, N·m or N. States of a joint whose torque is at the
       limit are held (conditional integration, Åström and Hägglund 2006).
+    - `rounds`: whether simulations round the readings; false in fitted loops.
     """
 
     law: AbstractController
@@ -41,6 +46,7 @@ class Sampled(AbstractController):
     window: int = eqx.field(static=True, default=1)
     cutoff: float | None = eqx.field(static=True, default=None)
     limit: Float[Array, " joints"] = eqx.field(converter=_vector, default=np.inf)
+    rounds: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self) -> None:
         if self.law.period is not None or self.law.pace > 0:
@@ -64,6 +70,10 @@ class Sampled(AbstractController):
     def judged(self) -> Literal["torque", "position"]:
         """The same as for the continuous law."""
         return self.law.judged
+
+    def settled(self, recordings: Iterable[Recording]) -> "Sampled":
+        """The law with exact readings, for fits."""
+        return dataclasses.replace(self, law=self.law.settled(recordings), rounds=False)
 
     def signals(self, recording: Recording) -> Signals:
         """The inputs of the continuous law, `(samples, joints)`."""
@@ -90,10 +100,13 @@ class Sampled(AbstractController):
         self, reading: Reading, past: list[Float[Array, " _"]], slow: list[Float[Array, " _"]]
     ) -> Reading:
         """Position and velocity as the drive computes them from its encoders."""
-        fine = jnp.broadcast_to(self.resolution, reading.q.shape)
-        step = jnp.where(fine > 0, fine, 1.0)
-        rounded = jnp.where(fine > 0, step * jnp.round(reading.q / step), reading.q)
-        q = reading.q + jax.lax.stop_gradient(rounded - reading.q)
+        q = reading.q
+        if self.rounds:
+            fine = jnp.broadcast_to(self.resolution, q.shape)
+            step = jnp.where(fine > 0, fine, 1.0)
+            rounded = jnp.where(fine > 0, step * jnp.round(q / step), q)
+            # The derivative of the rounding is set to one.
+            q = q + jax.lax.stop_gradient(rounded - q)
         v = (q - past[-1]) / (self.window * self.every) if past else reading.v
         if self.cutoff is not None:
             share = 1 - np.exp(-2 * np.pi * self.cutoff * self.every)

@@ -104,12 +104,13 @@ class WithinIntervals(diffrax.AbstractSolver):
 class ThroughIntervals(diffrax.AbstractSolver):
     """RK4 whose step is a whole interval; the loop's inputs are looked up once per interval.
 
-    Within an interval the state is split into rows, and time is in seconds.
+    Within an interval time is in seconds, and the state is split into rows if `split`.
     """
 
     method: Any
     rate: Rate
     substeps: int | Int[Array, ""]
+    split: bool = True
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
@@ -135,7 +136,7 @@ class ThroughIntervals(diffrax.AbstractSolver):
             start = interval.t0 + k * dt
             return self.method.step(inside, start, start + dt, y, None, None, False)[0]
 
-        rows = apart(y0)
+        rows = apart(y0) if self.split else y0
         if not isinstance(self.substeps, int):
             rows = jax.lax.fori_loop(0, self.substeps, substep, rows)
         elif self.substeps == 1:
@@ -143,7 +144,7 @@ class ThroughIntervals(diffrax.AbstractSolver):
         else:
             numbers = jnp.arange(self.substeps)
             rows, _ = jax.lax.scan(lambda y, k: (substep(k, y), None), rows, numbers)
-        y1 = together(rows, y0)
+        y1 = together(rows, y0) if self.split else rows
         return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
 

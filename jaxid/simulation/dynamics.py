@@ -30,6 +30,57 @@ def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Fl
     return jnp.stack(x)
 
 
+def forward(
+    loop: ClosedLoop,
+    q: Float[Array, " joints"],
+    v: Float[Array, " joints"],
+    torque: Float[Array, " joints"],
+    added: Float[Array, "joints joints"],
+) -> Float[Array, " joints"]:
+    """Accelerations of the links under a torque, `(joints,)`.
+
+    **Arguments:**
+
+    - `added`: inertia in addition to that of the links.
+    """
+    if loop.stepping.batched:
+        return _forward(loop.arm, q, v, torque, added)
+    matrix = loop.arm.mass_matrix(q) + added
+    return solve_positive(matrix, torque - loop.arm.bias(q, v))
+
+
+@eqx.filter_custom_jvp
+def _forward(arm, q, v, torque, added):
+    """`forward`, whose derivatives are those of inverse dynamics (Carpentier, Mansard 2018).
+
+    Differentiating the inertia matrix, the bias and the solution would take several times as long.
+    """
+    return solve_positive(arm.mass_matrix(q) + added, torque - arm.bias(q, v))
+
+
+@_forward.def_jvp
+def _forward_jvp(primals, tangents):
+    arm, q, v, torque, added = primals
+    d_arm, d_q, d_v, d_torque, d_added = tangents
+    matrix = arm.mass_matrix(q) + added
+    # The inverse, because it serves many tangents.
+    inverse = jax.vmap(lambda unit: solve_positive(matrix, unit))(jnp.eye(len(q)))
+    a = inverse @ (torque - arm.bias(q, v))
+    by_q, by_v = jax.jacfwd(lambda q, v: arm.inverse(q, v, a), argnums=(0, 1))(q, v)
+    change = jnp.zeros_like(a)
+    for slope, along in ((by_q, d_q), (by_v, d_v)):
+        if along is not None:
+            change = change - slope @ along
+    if d_torque is not None:
+        change = change + d_torque
+    if d_added is not None:
+        change = change - d_added @ a
+    if jax.tree.leaves(d_arm):
+        _, by_arm = eqx.filter_jvp(lambda arm: arm.inverse(q, v, a), (arm,), (d_arm,))
+        change = change - by_arm
+    return a, inverse @ change
+
+
 class Outside(eqx.Module):
     """External inputs of the loop at one instant; vectors are `(joints,)`.
 
@@ -171,8 +222,7 @@ def instant(
     """
     if imposed(loop):
         return _along_reference(loop, t, state, reference, outside, label)
-    seen = read(loop, state.q, state.v)
-    seen = Reading(seen.q + outside.noise.q, seen.v + outside.noise.v)
+    seen = reading(loop, state, outside)
     mass = loop.arm.mass_matrix(state.q)
     command = loop.controller.command(seen, reference, state.controller, mass)
     if loop.controller.imposes:
@@ -199,6 +249,12 @@ def instant(
             rates.append(effect.derivative(at))
     law = loop.controller.derivative(seen, reference, state.controller)
     return Instant(seen, command, motion.tau, a, State(state.v, a, tuple(rates), law))
+
+
+def reading(loop: ClosedLoop, state: State, outside: Outside) -> Reading:
+    """What the sensors read, unless the motion is imposed."""
+    seen = read(loop, state.q, state.v)
+    return Reading(seen.q + outside.noise.q, seen.v + outside.noise.v)
 
 
 def imposed(loop: ClosedLoop) -> bool:
@@ -288,13 +344,11 @@ def _accelerations(
 ) -> tuple[Float[Array, " joints"], dict[int, Float[Array, ""]]]:
     """Accelerations of the drives, and of each transmission's twist, by the effect's index."""
     added = _added_inertia(loop, motion, state.effects)
-    matrix = loop.arm.mass_matrix(state.q) + added
-    bias = loop.arm.bias(state.q, state.v)
     own = state.effects
     if any(effect.needs_acceleration for effect in loop.effects):
         drive, link = effect_loads(loop, motion, own, push=outside.push, curves=False)
         without = motion.tau - drive - link + outside.push + outside.pull
-        motion = dataclasses.replace(motion, a=solve_positive(matrix, without - bias))
+        motion = dataclasses.replace(motion, a=forward(loop, motion.q, motion.v, without, added))
     transmissions = [
         (k, e) for k, e in enumerate(loop.effects) if isinstance(e, AbstractTransmission)
     ]
@@ -303,7 +357,7 @@ def _accelerations(
     # Terms proportional to acceleration are already on the left-hand side.
     drive, link = effect_loads(loop, motion, own, push=outside.push, inertia=False)
     torque = motion.tau - drive - link + outside.push + outside.pull
-    return solve_positive(matrix, torque - bias), {}
+    return forward(loop, motion.q, motion.v, torque, added), {}
 
 
 def _through_transmissions(
@@ -329,9 +383,8 @@ def _through_transmissions(
     drive, held = effect_loads(loop, motion, state.effects, links, push=outside.push, inertia=False)
     available = motion.tau - drive + outside.push
     on_link = jnp.where(apart, passed, available)
-    matrix = loop.arm.mass_matrix(q) + added - jnp.diag(rotors)
     reaching = on_link - held + outside.pull
-    link = solve_positive(matrix, reaching - loop.arm.bias(q, v))
+    link = forward(loop, q, v, reaching, added - jnp.diag(rotors))
     a, twisting = link, {}
     for k, transmission in transmissions:
         j, there = transmission.joint - 1, transmission.present()

@@ -30,7 +30,7 @@ from .by_interval import (
     one_of,
     together,
 )
-from .dynamics import Instant, Outside, imposed, instant
+from .dynamics import Instant, Outside, imposed, instant, reading
 from .loop import ClosedLoop
 from .state import State, behind, rest, settle, unflatten
 from .stepping import ready
@@ -57,8 +57,8 @@ def _reference(interval: Interval, dt: Float[Array, ""]) -> Reference:
     return Reference(q, v, a, interval.torque[0] + dt * interval.torque[1], interval.held)
 
 
-def instant_at(loop: ClosedLoop, interval: Interval, t: Float[Array, ""], state: State) -> Instant:
-    """The loop at a time within an interval, s."""
+def outside_at(loop: ClosedLoop, interval: Interval, t: Float[Array, ""]) -> Outside:
+    """External inputs at a time within an interval, s."""
     dt = t - interval.t0
     noise, rate, push, pull = (
         _line(ends, dt, interval.h, loop.joints)
@@ -67,8 +67,13 @@ def instant_at(loop: ClosedLoop, interval: Interval, t: Float[Array, ""], state:
     bend = jnp.zeros(loop.joints)
     if interval.rate is not None:
         bend = (interval.rate[1] - interval.rate[0]) / jnp.where(interval.h > 0, interval.h, 1.0)
-    outside = Outside(push, pull, Reading(noise, rate), bend)
-    return instant(loop, t, state, _reference(interval, dt), outside, interval.label)
+    return Outside(push, pull, Reading(noise, rate), bend)
+
+
+def instant_at(loop: ClosedLoop, interval: Interval, t: Float[Array, ""], state: State) -> Instant:
+    """The loop at a time within an interval, s."""
+    outside = outside_at(loop, interval, t)
+    return instant(loop, t, state, _reference(interval, t - interval.t0), outside, interval.label)
 
 
 def initial(
@@ -93,9 +98,9 @@ def observe(
     def begin(interval: Interval, x: Float[Array, " states"]):
         state = unravel(x)
         if loop.controller.period is not None:
-            now = instant_at(loop, interval, interval.t0, state)
             asked = _reference(interval, jnp.zeros(()))
-            ticked = loop.controller.tick(now.reading, asked, state.controller)
+            sensed = reading(loop, state, outside_at(loop, interval, interval.t0))
+            ticked = loop.controller.tick(sensed, asked, state.controller)
             held = jnp.where(interval.tick, ticked, state.controller)
             state = dataclasses.replace(state, controller=held)
         now = instant_at(loop, interval, interval.t0, state)
@@ -103,20 +108,29 @@ def observe(
         return ravel_pytree(state)[0], jnp.stack([seen[row] for row in rows])
 
     # Along a given motion the instants are independent, so many are computed as one array.
-    return begin(interval, x) if imposed(loop) else unrolled(begin, interval, x)(interval, x)
+    if imposed(loop) or loop.stepping.batched:
+        return begin(interval, x)
+    return unrolled(begin, interval, x)(interval, x)
 
 
 # --- one solve ----------------------------------------------------------------------------------
 
 
 def _rate(loop: ClosedLoop, intervals: Interval, x: Float[Array, " states"]) -> Rate:
-    """The loop's equations, 1/s, unrolled: a function of an interval, a time in it and a state."""
+    """The loop's equations, 1/s: a function of an interval, a time in it and a state.
+
+    The state is unrolled to scalars, unless many intervals are computed in one batch.
+    """
     unravel = unflatten(loop)
 
-    def rate(interval: Interval, t: Float[Array, ""], y: Scalars) -> Scalars:
-        derivative = instant_at(loop, interval, t, unravel(jnp.stack(y))).derivative
-        return tuple(ravel_pytree(derivative)[0])
+    def whole(interval: Interval, t: Float[Array, ""], x: Float[Array, " states"]):
+        return ravel_pytree(instant_at(loop, interval, t, unravel(x)).derivative)[0]
 
+    def rate(interval: Interval, t: Float[Array, ""], y: Scalars) -> Scalars:
+        return tuple(whole(interval, t, jnp.stack(y)))
+
+    if loop.stepping.batched:
+        return whole
     if imposed(loop):
         return rate
     first = one_of(intervals, jnp.asarray(0))
@@ -290,7 +304,7 @@ def through_interval(
     if loop.stepping.plain:
         # One step cannot fail; a solve around it would only lengthen the compilation.
         count = _substeps(loop, substeps)
-        solver = ThroughIntervals(loop.stepping.solver, rate, count)
+        solver = ThroughIntervals(loop.stepping.solver, rate, count, not loop.stepping.batched)
         start = jnp.zeros(())
         return solver.step(None, start, start + 1, x, Window(alone), None, False)[0], success()
     stop = None

@@ -89,6 +89,8 @@ _SAID: set[str] = set()
 def say_what_splits(eqn, origin) -> None:
     """Warns, once per function of the model, of an operation that a loop's kernel cannot contain.
 
+    Chains of bodies are not named: they are jaxid's, and users cannot change them.
+
     **Arguments:**
 
     - `eqn`: an equation that is evaluated with whole arrays.
@@ -98,7 +100,7 @@ def say_what_splits(eqn, origin) -> None:
     if found is None or jax.default_backend() != "cpu":
         return
     who = _written_in(origin)
-    if who in _SAID:
+    if who is None or who in _SAID:
         return
     _SAID.add(who)
     warnings.warn(
@@ -136,15 +138,18 @@ _LIBRARIES = tuple(
     str(Path(sys.modules[name].__file__ or "").parent) for name in ("jax", "jaxlib", "equinox")
 )
 _HERE = str(Path(__file__).parent)
+_CHAIN = str(Path(__file__).parents[1] / "chain.py")
 
 
-def _written_in(eqn) -> str:
-    """The function of the model that an equation comes from: the last that the simulation called"""
+def _written_in(eqn) -> str | None:
+    """The function of the model that an equation comes from: the last that the simulation called;
+    None for a chain of bodies."""
     frames = getattr(getattr(eqn.source_info, "traceback", None), "frames", ())
-    called = "the model"
+    called, own = "the model", False
     for frame in frames:
         if frame.file_name.startswith(_HERE):
             break
         if not frame.file_name.startswith(_LIBRARIES):
+            own |= frame.file_name == _CHAIN
             called = f"{frame.function_name} ({Path(frame.file_name).name}, line {frame.line_num})"
-    return called
+    return None if own else called

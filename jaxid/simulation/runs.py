@@ -29,7 +29,7 @@ from .integration import (
 )
 from .loop import ClosedLoop
 from .sharing import one_by_one
-from .steps import set_substeps, with_forward_mode, with_rolled_stages, with_substeps
+from .steps import set_substeps, with_batches, with_forward_mode, with_rolled_stages, with_substeps
 
 
 class Simulated(eqx.Module):
@@ -109,10 +109,29 @@ def run(
     return states, seen, unless_finite(code, states[-1])
 
 
+# Intervals of a batch whose derivatives are computed together; more leave the caches.
+_BLOCK = 16
+
+
 def at_points(loop: ClosedLoop, fun: Callable, *args):
-    """Maps a function of an interval and more over grid points, as one batch if the motion is
-    given."""
+    """Maps a function of an interval and more over grid points: as one batch if the motion is
+    given, in small batches for loops `with_batches`, otherwise one after the other."""
+    if loop.stepping.batched:
+        found = jax.lax.map(lambda block: jax.vmap(fun)(*block), _blocks(args))
+        count = jax.tree.leaves(args)[0].shape[0]
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], found)
     return jax.vmap(fun)(*args) if imposed(loop) else each(fun, *args)
+
+
+def _blocks(args):
+    """Leaves of `(points, ...)` as `(blocks, _BLOCK, ...)`; the last point fills the last block."""
+
+    def parted(leaf):
+        missing = -leaf.shape[0] % _BLOCK
+        filled = jnp.concatenate([leaf, jnp.repeat(leaf[-1:], missing, axis=0)])
+        return filled.reshape(-1, _BLOCK, *leaf.shape[1:])
+
+    return jax.tree.map(parted, args)
 
 
 def _ticking(loop, intervals, x0, substeps, rows):
@@ -168,6 +187,9 @@ def run_with_sensitivities(
       `(states, columns)`.
     - `rows`: which of `SIGNALS`.
     """
+    many = with_batches(loop)
+    if many.stepping.batched:
+        return _in_batches(loop, many, intervals, x0, start, rows)
     loop, columns = with_rolled_stages(loop), start.shape[1]
     if loop.stepping.plain and loop.controller.period is None and not given(loop):
         states, tangents = integrate_with_tangents(loop, intervals, x0, start)
@@ -195,8 +217,56 @@ def run_with_sensitivities(
     return Sensitivities(seen, slopes, end, end_slopes, code)
 
 
+def _in_batches(
+    loop: ClosedLoop,
+    many: ClosedLoop,
+    intervals: Interval,
+    x0: Float[Array, " states"],
+    start: Float[Array, "states columns"],
+    rows: tuple[int, ...],
+) -> Sensitivities:
+    """`run_with_sensitivities`, whose tangents follow from derivatives of single intervals.
+
+    **Arguments:**
+
+    - `many`: the loop `with_batches`.
+    """
+    states, seen, code = run(with_rolled_stages(loop), intervals, x0, rows=rows)
+    theta, m, p = loop.theta, x0.shape[0], loop.theta.shape[0]
+    # The last grid point ends the run; points that fill a block follow it.
+    inside = jnp.arange(states.shape[0]) < states.shape[0] - 1
+
+    def at(interval: Interval, x: Float[Array, " states"]):
+        def one(u):
+            own = many.with_theta(u[m:])
+            held, shown = observe(own, interval, u[:m], rows)
+            after, _ = through_interval(own, interval, held)
+            return jnp.concatenate([after, shown.ravel()])
+
+        return jax.jacfwd(one)(jnp.concatenate([x, theta]))
+
+    def along(tangents, point):
+        slope, going = point
+        change = slope[:, :m] @ tangents
+        change = change.at[:, :p].add(slope[:, m:])
+        return jnp.where(going, change[:m], tangents), change[m:]
+
+    def through(tangents, block):
+        interval, x, going = block
+        return jax.lax.scan(along, tangents, (jax.vmap(at)(interval, x), going))
+
+    last, slopes = jax.lax.scan(through, start, _blocks((intervals, states, inside)))
+    slopes = slopes.reshape(-1, *slopes.shape[2:])[: len(states)]
+    slopes = slopes.reshape(*seen.shape, start.shape[1])
+    return Sensitivities(seen, slopes, states[-1], last, code)
+
+
 @compiled
 def _simulate(loop: ClosedLoop, batch: Batch, substeps: Int[Array, ""] | None) -> Simulated:
+    if with_batches(loop).stepping.batched:
+        # Half of the compilation, which takes longer than dozens of runs.
+        loop = with_rolled_stages(loop)
+
     def one(intervals, at, q0, v0, time):
         states, seen, code = run(loop, intervals, initial(loop, intervals, q0, v0), substeps)
         if at is not None:

@@ -22,9 +22,11 @@ class RK4(diffrax.AbstractSolver):
     **Arguments:**
 
     - `rolled`: whether the stages are a loop, which compiles faster and needs less memory.
+    - `batched`: whether many intervals are computed as one batch, so equations remain arrays.
     """
 
     rolled: bool = eqx.field(static=True, default=False)
+    batched: bool = eqx.field(static=True, default=False)
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
@@ -120,6 +122,11 @@ class Stepping(eqx.Module):
                 f"{name} gives no error estimate, which {type(self.control).__name__} needs: "
                 "choose another solver, or leave out control for fixed steps"
             )
+
+    @property
+    def batched(self) -> bool:
+        """Whether many intervals are computed as one batch; then equations are not unrolled."""
+        return isinstance(self.solver, RK4) and self.solver.batched
 
     @property
     def plain(self) -> bool:
