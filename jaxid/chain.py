@@ -1,6 +1,7 @@
 """A chain of joints in space: forward kinematics and inverse dynamics."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -110,20 +111,61 @@ class Chain(eqx.Module):
     ) -> Float[Array, "joints joints"]:
         """Inertia at q, `(joints, joints)`, by composite bodies about the base's origin."""
         turns, places, axes = self.frames(q)
-        turning, _ = self._apart(axes)
-        passing = jnp.where(np.array(self.slides)[:, None], axes, jnp.cross(places, axes))
-        inertia, moment, mass = _in_base(bodies, turns)
-        shift = 2 * jnp.einsum("ki,ki->k", places, moment)[:, None, None] * np.eye(3)
-        both = jnp.einsum("ki,kj->kij", places, moment)
-        square = jnp.einsum("ki,ki->k", places, places)[:, None, None] * np.eye(3)
-        own = square - jnp.einsum("ki,kj->kij", places, places)
-        inertia = inertia + shift - both - both.mT + mass[:, :, None] * own
-        moment = moment + mass * places
-        inertia, moment, mass = (jnp.cumsum(x[::-1], axis=0)[::-1] for x in (inertia, moment, mass))
+        turning, passing = self._screws(places, axes)
+        inertia, moment, mass = _beyond(*_about_base(bodies, turns, places))
         linear = mass * passing + jnp.cross(turning, moment)
         angular = jnp.einsum("kij,kj->ki", inertia, turning) + jnp.cross(moment, passing)
         upper = jnp.triu(turning @ angular.T + passing @ linear.T)
         return upper + jnp.triu(upper, 1).T
+
+    def _screws(
+        self, places: Float[Array, "joints 3"], axes: Float[Array, "joints 3"]
+    ) -> tuple[Float[Array, "joints 3"], Float[Array, "joints 3"]]:
+        """Angular velocity of the links beyond each joint, and velocity of their point at the
+        base's origin, for a joint velocity of one."""
+        turning, _ = self._apart(axes)
+        slides = np.array(self.slides)[:, None]
+        return turning, jnp.where(slides, axes, jnp.cross(places, axes))
+
+    def inverse_slopes(
+        self,
+        bodies: Float[Array, "joints 10"],
+        q: Float[Array, " joints"],
+        v: Float[Array, " joints"],
+        a: Float[Array, " joints"],
+    ) -> tuple[Float[Array, "joints joints"], Float[Array, "joints joints"]]:
+        """Derivatives of `inverse` by position and by velocity, `(torque, joint)`.
+
+        In spatial vectors about the base's origin, moments before forces (Singh, Russell, Wensing
+        2022). Differentiating `inverse` would compute it once for each joint.
+
+        **Arguments:** as for `inverse`.
+        """
+        turns, places, axes = self.frames(q)
+        s = jnp.concatenate(self._screws(places, axes), axis=1)
+        speed = jnp.cumsum(s * v[:, None], axis=0)
+        before = _previous(speed, np.zeros(6))
+        change = _across(speed, s)
+        fall = jnp.concatenate([np.zeros(3), -self.gravity])
+        rise = fall + jnp.cumsum(s * a[:, None] + change * v[:, None], axis=0)
+        moved = _across(before, s)
+        bent = _across(_previous(rise, fall), s) + _across(before, moved)
+        inertia = _spatial(*_about_base(bodies, turns, places))
+        momentum = _times(inertia, speed)
+        force = _times(inertia, rise) + _across_force(speed, momentum)
+        cross = jax.vmap(_motion_matrix)(speed)
+        twice_b = _force_matrix(momentum) - inertia @ cross - cross.mT @ inertia
+        inertia, twice_b, force = _beyond(inertia, twice_b, force)
+        left, left_b = (jnp.einsum("ki,kij->kj", s, x) for x in (inertia, twice_b))
+        by_q = left_b @ moved.T + left @ bent.T
+        by_v = left_b @ s.T + left @ (moved + change).T
+        above = _times(twice_b, moved) + _times(inertia, bent) + _across_force(s, force)
+        above_v = _times(twice_b, s) + _times(inertia, moved + change)
+
+        def whole(below, above):
+            return jnp.tril(below) + jnp.triu(s @ above.T, 1)
+
+        return whole(by_q, above), whole(by_v, above_v)
 
 
 class InSpace(eqx.Module):
@@ -155,6 +197,84 @@ def moved_body(body: Float[Array, "10"], place: Float[Array, "3"]) -> Float[Arra
 
 def _cross_matrix(x: Float[Array | np.ndarray, "3"]) -> Float[Array, "3 3"]:
     return jnp.cross(np.eye(3), x)
+
+
+def _about_base(
+    bodies: Float[Array, "joints 10"],
+    turns: Float[Array, "joints 3 3"],
+    places: Float[Array, "joints 3"],
+) -> tuple[Float[Array, "joints 3 3"], Float[Array, "joints 3"], Float[Array, "joints 1"]]:
+    """Inertia, first moment and mass of each link about the base's origin (parallel axes)."""
+    inertia, moment, mass = _in_base(bodies, turns)
+    shift = 2 * jnp.einsum("ki,ki->k", places, moment)[:, None, None] * np.eye(3)
+    both = jnp.einsum("ki,kj->kij", places, moment)
+    square = jnp.einsum("ki,ki->k", places, places)[:, None, None] * np.eye(3)
+    own = square - jnp.einsum("ki,kj->kij", places, places)
+    inertia = inertia + shift - both - both.mT + mass[:, :, None] * own
+    return inertia, moment + mass * places, mass
+
+
+def _beyond(*of_links: Float[Array, "joints ..."]) -> tuple[Float[Array, "joints ..."], ...]:
+    """Sums over the links beyond each joint."""
+    return tuple(jnp.cumsum(x[::-1], axis=0)[::-1] for x in of_links)
+
+
+def _previous(x: Float[Array, "joints 6"], first: Float[Array | np.ndarray, "6"]):
+    """The value of the link before each joint, that of the base first."""
+    return jnp.concatenate([jnp.asarray(first)[None], x[:-1]])
+
+
+# --- spatial vectors and matrices: motions (angular, linear), forces (moment, force) -----------
+
+
+def _across(x: Float[Array, "joints 6"], m: Float[Array, "joints 6"]) -> Float[Array, "joints 6"]:
+    """Cross product of motions."""
+    turning, passing = x[:, :3], x[:, 3:]
+    linear = jnp.cross(turning, m[:, 3:]) + jnp.cross(passing, m[:, :3])
+    return jnp.concatenate([jnp.cross(turning, m[:, :3]), linear], axis=1)
+
+
+def _across_force(
+    x: Float[Array, "joints 6"], f: Float[Array, "joints 6"]
+) -> Float[Array, "joints 6"]:
+    """Cross product of motions with forces."""
+    turning, passing = x[:, :3], x[:, 3:]
+    moment = jnp.cross(turning, f[:, :3]) + jnp.cross(passing, f[:, 3:])
+    return jnp.concatenate([moment, jnp.cross(turning, f[:, 3:])], axis=1)
+
+
+def _times(
+    matrices: Float[Array, "joints 6 6"], vectors: Float[Array, "joints 6"]
+) -> Float[Array, "joints 6"]:
+    return jnp.einsum("kij,kj->ki", matrices, vectors)
+
+
+def _skew(x: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The matrix of the cross product with a vector on its left."""
+    return jnp.cross(x, np.eye(3)).T
+
+
+def _motion_matrix(x: Float[Array, "6"]) -> Float[Array, "6 6"]:
+    """The matrix of `_across`; that of `_across_force` is its negative transpose."""
+    turning, passing = _skew(x[:3]), _skew(x[3:])
+    return jnp.block([[turning, np.zeros((3, 3))], [passing, turning]])
+
+
+def _force_matrix(f: Float[Array, "joints 6"]) -> Float[Array, "joints 6 6"]:
+    """The matrices that map motions x to `_across_force(x, f)`."""
+    units = jnp.eye(6)
+    return jax.vmap(lambda f: _across_force(units, jnp.broadcast_to(f, (6, 6))).T)(f)
+
+
+def _spatial(
+    inertia: Float[Array, "joints 3 3"],
+    moment: Float[Array, "joints 3"],
+    mass: Float[Array, "joints 1"],
+) -> Float[Array, "joints 6 6"]:
+    """Spatial inertia."""
+    across = jax.vmap(_skew)(moment)
+    linear = mass[:, :, None] * np.eye(3)
+    return jnp.block([[inertia, across], [-across, linear]])
 
 
 def _in_base(

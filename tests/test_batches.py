@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.arms import AbstractArm
 from jaxid.discovery.linear import base_columns, linearise
 from jaxid.simulation.batch import prepare
 from jaxid.simulation.dynamics import forward
@@ -134,6 +135,14 @@ def test_accelerations_have_the_derivatives_of_pinocchio():
         inverse = np.triu(data.Minv) + np.triu(data.Minv, 1).T
         for ours, theirs in ((by_q, data.ddq_dq), (by_v, data.ddq_dv), (by_tau, inverse)):
             np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9 * np.abs(theirs).max())
+
+
+def test_derivatives_of_inverse_dynamics_are_those_of_autodiff():
+    arm = drive().arm
+    q, v, a = map(jnp.asarray, np.random.default_rng(2).normal(size=(3, 4)))
+    expected = AbstractArm.inverse_slopes(arm, q, v, a)
+    for ours, theirs in zip(arm.inverse_slopes(q, v, a), expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12 * np.abs(theirs).max())
 
 
 def test_few_joints_are_unrolled():

@@ -52,6 +52,12 @@ class AbstractArm(eqx.Module):
         """Torque needed for a motion (inverse dynamics), `(joints,)`, N·m or N."""
         return self.mass_matrix(q) @ a + self.bias(q, v)
 
+    def inverse_slopes(
+        self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
+    ) -> tuple[Float[Array, "joints joints"], Float[Array, "joints joints"]]:
+        """Derivatives of `inverse` by position and velocity, `(torque, joint)`."""
+        return jax.jacfwd(lambda q, v: self.inverse(q, v, a), argnums=(0, 1))(q, v)
+
     def regressor(
         self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
     ) -> Float[Array, "joints parameters"]:

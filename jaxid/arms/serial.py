@@ -159,6 +159,12 @@ class SerialArm(AbstractArm):
         """Torque needed for a motion, `(joints,)`, N·m or N, without forming the inertia matrix."""
         return self.chain.inverse(self.inertias(), q, v, a)
 
+    def inverse_slopes(
+        self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
+    ) -> tuple[Float[Array, "joints joints"], Float[Array, "joints joints"]]:
+        """Derivatives of `inverse` by position and velocity, `(torque, joint)`."""
+        return self.chain.inverse_slopes(self.inertias(), q, v, a)
+
     def absorbed_rotors(self) -> tuple[bool, ...]:
         """Whether each joint's rotor inertia is part of a base parameter, `(joints,)`."""
         rows, a = _regressor(_geometry(self.chain), self.chain.slides, self.lower, self.upper)

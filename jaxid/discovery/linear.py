@@ -175,8 +175,8 @@ def respond(
     return one_by_one(lambda one: _response(one[0], place, one[1]), (linear, values))
 
 
-# With more states a product of matrices is faster than one loop over the columns: with 36 states and
-# 5000 columns by a factor of five, with 16 states and 600 columns by nothing.
+# With more states a product of matrices is faster than one loop over the columns: with 36 states
+# and 5000 columns by a factor of five, with 16 states and 600 columns by nothing.
 _FEW_STATES = 16
 
 

@@ -51,9 +51,10 @@ def forward(
 
 @eqx.filter_custom_jvp
 def _forward(arm, q, v, torque, added):
-    """`forward`, whose derivatives are those of inverse dynamics (Carpentier, Mansard 2018).
+    """`forward`, with derivatives that follow from those of inverse dynamics.
 
-    Differentiating the inertia matrix, the bias and the solution would take several times as long.
+    Differentiating the inertia matrix, the bias and the solution would take several times as long
+    (Carpentier, Mansard 2018).
     """
     return solve_positive(arm.mass_matrix(q) + added, torque - arm.bias(q, v))
 
@@ -66,7 +67,7 @@ def _forward_jvp(primals, tangents):
     # The inverse, because it serves many tangents.
     inverse = jax.vmap(lambda unit: solve_positive(matrix, unit))(jnp.eye(len(q)))
     a = inverse @ (torque - arm.bias(q, v))
-    by_q, by_v = jax.jacfwd(lambda q, v: arm.inverse(q, v, a), argnums=(0, 1))(q, v)
+    by_q, by_v = arm.inverse_slopes(q, v, a)
     change = jnp.zeros_like(a)
     for slope, along in ((by_q, d_q), (by_v, d_v)):
         if along is not None:

@@ -155,7 +155,7 @@ def with_batches(loop: ClosedLoop) -> ClosedLoop:
 
     The equations of a few joints are unrolled, and their tangents integrated with the state. Those
     of many joints are not one kernel but hundreds, each called for every step. With 16 intervals in
-    a batch, a Jacobian of six joints takes an eighth of the time. Needs fixed steps of RK4.
+    a batch, a Jacobian of six joints takes a twelfth of the time. Needs fixed steps of RK4.
     """
     stepping = loop.stepping
     if loop.joints <= _UNROLLED or not stepping.plain or given(loop):
