@@ -196,6 +196,7 @@ def moved_body(body: Float[Array, "10"], place: Float[Array, "3"]) -> Float[Arra
 
 
 def _cross_matrix(x: Float[Array | np.ndarray, "3"]) -> Float[Array, "3 3"]:
+    """The matrix of the cross product with a vector on its left."""
     return jnp.cross(np.eye(3), x)
 
 
@@ -249,14 +250,9 @@ def _times(
     return jnp.einsum("kij,kj->ki", matrices, vectors)
 
 
-def _skew(x: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """The matrix of the cross product with a vector on its left."""
-    return jnp.cross(x, np.eye(3)).T
-
-
 def _motion_matrix(x: Float[Array, "6"]) -> Float[Array, "6 6"]:
     """The matrix of `_across`; that of `_across_force` is its negative transpose."""
-    turning, passing = _skew(x[:3]), _skew(x[3:])
+    turning, passing = _cross_matrix(x[:3]), _cross_matrix(x[3:])
     return jnp.block([[turning, np.zeros((3, 3))], [passing, turning]])
 
 
@@ -272,7 +268,7 @@ def _spatial(
     mass: Float[Array, "joints 1"],
 ) -> Float[Array, "joints 6 6"]:
     """Spatial inertia."""
-    across = jax.vmap(_skew)(moment)
+    across = jax.vmap(_cross_matrix)(moment)
     linear = mass[:, :, None] * np.eye(3)
     return jnp.block([[inertia, across], [-across, linear]])
 
