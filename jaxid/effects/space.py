@@ -142,7 +142,9 @@ class CarriedBody(AbstractEffect):
 
     def about_tip(self) -> Float[Array, "10"]:
         """Its parameters in the order of `BODY` about the tip, SI units."""
-        return jnp.zeros(10).at[jnp.asarray(self.shown, int)].set(self.rest).at[MASS].set(self.mass)
+        # Number by number: an array operation would break up the kernel of a simulation's loop.
+        given = {**dict(zip(self.shown, self.rest, strict=True)), MASS: self.mass}
+        return jnp.stack([jnp.asarray(given.get(k, 0.0)) for k in range(10)])
 
     def centre(self) -> Float[Array, "3"]:
         """Position of its centre of mass in the last link's frame, m."""
