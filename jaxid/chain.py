@@ -134,7 +134,7 @@ class Chain(eqx.Module):
         v: Float[Array, " joints"],
         a: Float[Array, " joints"],
     ) -> tuple[Float[Array, "joints joints"], Float[Array, "joints joints"]]:
-        """Derivatives of `inverse` by position and by velocity, `(torque, joint)`.
+        """Derivatives of `inverse` by position and velocity, a row for each torque, SI units.
 
         In spatial vectors about the base's origin, moments before forces (Singh, Russell, Wensing
         2022). Differentiating `inverse` would compute it once for each joint.
@@ -247,6 +247,7 @@ def _across_force(
 def _times(
     matrices: Float[Array, "joints 6 6"], vectors: Float[Array, "joints 6"]
 ) -> Float[Array, "joints 6"]:
+    """Each matrix times its vector."""
     return jnp.einsum("kij,kj->ki", matrices, vectors)
 
 
@@ -267,7 +268,7 @@ def _spatial(
     moment: Float[Array, "joints 3"],
     mass: Float[Array, "joints 1"],
 ) -> Float[Array, "joints 6 6"]:
-    """Spatial inertia."""
+    """Spatial inertia of each link, from the results of `_about_base`."""
     across = jax.vmap(_cross_matrix)(moment)
     linear = mass[:, :, None] * np.eye(3)
     return jnp.block([[inertia, across], [-across, linear]])

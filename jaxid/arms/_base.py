@@ -55,7 +55,7 @@ class AbstractArm(eqx.Module):
     def inverse_slopes(
         self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
     ) -> tuple[Float[Array, "joints joints"], Float[Array, "joints joints"]]:
-        """Derivatives of `inverse` by position and velocity, `(torque, joint)`."""
+        """Derivatives of `inverse` by position and velocity, a row for each torque, SI units."""
         return jax.jacfwd(lambda q, v: self.inverse(q, v, a), argnums=(0, 1))(q, v)
 
     def regressor(

@@ -162,7 +162,7 @@ class SerialArm(AbstractArm):
     def inverse_slopes(
         self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
     ) -> tuple[Float[Array, "joints joints"], Float[Array, "joints joints"]]:
-        """Derivatives of `inverse` by position and velocity, `(torque, joint)`."""
+        """Derivatives of `inverse` by position and velocity, a row for each torque, SI units."""
         return self.chain.inverse_slopes(self.inertias(), q, v, a)
 
     def absorbed_rotors(self) -> tuple[bool, ...]:

@@ -197,8 +197,8 @@ def finer_substeps(done: Converged, before: float = np.inf) -> tuple[int | None,
     """A finer number of substeps, if halving the step moves the torque by more than 1e-4.
 
     None for a model that explains nothing: its values are meaningless, and may need any number.
-    None also if the last refinement did not reduce the change: encoders in the loop that round
-    differently cause a change that no step removes.
+    None also if the last refinement did not reduce the change: a user's law that rounds its
+    readings rounds them differently, which causes a change that no step removes.
 
     **Arguments:**
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ..arms import AbstractArm
 from ..control import Reading, Reference
 from ..effects import AbstractEffect, AbstractTransmission, DriveGain, Motion
 from .loop import ClosedLoop
@@ -37,11 +38,12 @@ def forward(
     torque: Float[Array, " joints"],
     added: Float[Array, "joints joints"],
 ) -> Float[Array, " joints"]:
-    """Accelerations of the links under a torque, `(joints,)`.
+    """Accelerations of the links under a torque, `(joints,)`, rad/s² or m/s².
 
     **Arguments:**
 
-    - `added`: inertia in addition to that of the links.
+    - `q`, `v`: position and velocity of the links. `torque`: on them, N·m or N.
+    - `added`: inertia in addition to that of the links, kg·m² or kg.
     """
     if loop.stepping.batched:
         return _forward(loop.arm, q, v, torque, added)
@@ -50,8 +52,8 @@ def forward(
 
 
 @eqx.filter_custom_jvp
-def _forward(arm, q, v, torque, added):
-    """`forward`, with derivatives that follow from those of inverse dynamics.
+def _forward(arm: AbstractArm, q, v, torque, added):
+    """`forward` of an arm, with derivatives that follow from those of inverse dynamics.
 
     Differentiating the inertia matrix, the bias and the solution would take several times as long
     (Carpentier, Mansard 2018).

@@ -29,7 +29,14 @@ from .integration import (
 )
 from .loop import ClosedLoop
 from .sharing import one_by_one
-from .steps import set_substeps, with_batches, with_forward_mode, with_rolled_stages, with_substeps
+from .steps import (
+    UNROLLED,
+    set_substeps,
+    with_batches,
+    with_forward_mode,
+    with_rolled_stages,
+    with_substeps,
+)
 
 
 class Simulated(eqx.Module):
@@ -187,9 +194,8 @@ def run_with_sensitivities(
       `(states, columns)`.
     - `rows`: which of `SIGNALS`.
     """
-    many = with_batches(loop)
-    if many.stepping.batched:
-        return _in_batches(loop, many, intervals, x0, start, rows)
+    if with_batches(loop).stepping.batched:
+        return _in_batches(loop, intervals, x0, start, rows)
     loop, columns = with_rolled_stages(loop), start.shape[1]
     if loop.stepping.plain and loop.controller.period is None and not given(loop):
         states, tangents = integrate_with_tangents(loop, intervals, x0, start)
@@ -219,19 +225,15 @@ def run_with_sensitivities(
 
 def _in_batches(
     loop: ClosedLoop,
-    many: ClosedLoop,
     intervals: Interval,
     x0: Float[Array, " states"],
     start: Float[Array, "states columns"],
     rows: tuple[int, ...],
 ) -> Sensitivities:
-    """`run_with_sensitivities`, whose tangents follow from derivatives of single intervals.
-
-    **Arguments:**
-
-    - `many`: the loop `with_batches`.
-    """
+    """`run_with_sensitivities` of a loop `with_batches`: tangents follow from the derivatives of
+    single intervals."""
     states, seen, code = run(with_rolled_stages(loop), intervals, x0, rows=rows)
+    many = with_batches(loop)
     theta, m, p = loop.theta, x0.shape[0], loop.theta.shape[0]
     # The last grid point ends the run; points that fill a block follow it.
     inside = jnp.arange(states.shape[0]) < states.shape[0] - 1
@@ -263,7 +265,7 @@ def _in_batches(
 
 @compiled
 def _simulate(loop: ClosedLoop, batch: Batch, substeps: Int[Array, ""] | None) -> Simulated:
-    if with_batches(loop).stepping.batched:
+    if loop.joints > UNROLLED:
         # Half of the compilation, which takes longer than dozens of runs.
         loop = with_rolled_stages(loop)
 

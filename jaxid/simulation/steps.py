@@ -146,8 +146,8 @@ def with_rolled_stages(loop: ClosedLoop) -> ClosedLoop:
     return dataclasses.replace(loop, stepping=stepping)
 
 
-# Joints above which unrolled derivatives have too many scalars.
-_UNROLLED = 3
+# Number of joints above which unrolled derivatives have too many scalars.
+UNROLLED = 3
 
 
 def with_batches(loop: ClosedLoop) -> ClosedLoop:
@@ -158,7 +158,7 @@ def with_batches(loop: ClosedLoop) -> ClosedLoop:
     a batch, a Jacobian of six joints takes a twelfth of the time. Needs fixed steps of RK4.
     """
     stepping = loop.stepping
-    if loop.joints <= _UNROLLED or not stepping.plain or given(loop):
+    if loop.joints <= UNROLLED or not stepping.plain or given(loop):
         return loop
     solver = RK4(rolled=True, batched=True)
     return dataclasses.replace(loop, stepping=dataclasses.replace(stepping, solver=solver))
