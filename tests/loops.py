@@ -45,6 +45,23 @@ FINE = jaxid.Stepping(substeps=8)
 SPLINE = {"rtol": 0, "atol": 5e-5}
 
 
+def four_joints() -> str:
+    """A URDF of an arm that turns about crossing axes, with one sliding joint."""
+    axes = ("0 0 1", "0 1 0", "1 0 0", "0 1 0")
+    kinds = ("revolute", "revolute", "prismatic", "revolute")
+    parts = ['<robot name="four"><link name="l0"/>']
+    for k, (axis, kind) in enumerate(zip(axes, kinds, strict=True), start=1):
+        parts.append(
+            f'<link name="l{k}"><inertial><origin xyz="0.1 0.02 0.{k}" rpy="0.1 0.2 0"/>'
+            f'<mass value="{5 - k}"/><inertia ixx="0.0{k}" iyy="0.05" izz="0.04" ixy="0.001" '
+            f'ixz="0.002" iyz="0"/></inertial></link>'
+            f'<joint name="j{k}" type="{kind}"><parent link="l{k - 1}"/><child link="l{k}"/>'
+            f'<origin xyz="0.2 0 0.1" rpy="0 0.{k} 0.1"/><axis xyz="{axis}"/>'
+            f'<limit lower="-2" upper="2" effort="99" velocity="9"/></joint>'
+        )
+    return "".join([*parts, "</robot>"])
+
+
 def scara(*effects, stepping=FINE):
     """The SCARA of the independent plant, with more effects."""
     loop = jaxid.scara().with_values(**SCARA_VALUES).add(*effects)

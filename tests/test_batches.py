@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from loops import four_joints
 
 import jaxid
 from jaxid.arms import AbstractArm
@@ -17,23 +18,6 @@ from jaxid.simulation.steps import with_batches, with_substeps
 pinocchio = pytest.importorskip("pinocchio")
 
 GAINS = np.array([60.0, 50.0, 30.0, 10.0])
-
-
-def four_joints() -> str:
-    """A URDF of an arm that turns about crossing axes, with one sliding joint."""
-    axes = ("0 0 1", "0 1 0", "1 0 0", "0 1 0")
-    kinds = ("revolute", "revolute", "prismatic", "revolute")
-    parts = ['<robot name="four"><link name="l0"/>']
-    for k, (axis, kind) in enumerate(zip(axes, kinds, strict=True), start=1):
-        parts.append(
-            f'<link name="l{k}"><inertial><origin xyz="0.1 0.02 0.{k}" rpy="0.1 0.2 0"/>'
-            f'<mass value="{5 - k}"/><inertia ixx="0.0{k}" iyy="0.05" izz="0.04" ixy="0.001" '
-            f'ixz="0.002" iyz="0"/></inertial></link>'
-            f'<joint name="j{k}" type="{kind}"><parent link="l{k - 1}"/><child link="l{k}"/>'
-            f'<origin xyz="0.2 0 0.1" rpy="0 0.{k} 0.1"/><axis xyz="{axis}"/>'
-            f'<limit lower="-2" upper="2" effort="99" velocity="9"/></joint>'
-        )
-    return "".join([*parts, "</robot>"])
 
 
 def moving(samples: int) -> jaxid.Recording:

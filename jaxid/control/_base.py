@@ -54,6 +54,11 @@ class AbstractController(eqx.Module):
         """Time between two ticks, s; None for a continuous law."""
         return None
 
+    @property
+    def lag(self) -> float:
+        """Mean time between a sample and the action of the torque recorded there, s."""
+        return (self.period or 0.0) / 2
+
     def initial_state(self, reading: Reading) -> Float[Array, " states"]:
         """States of the law before the first tick; none by default."""
         return jnp.zeros(0)

@@ -67,6 +67,11 @@ class Sampled(AbstractController):
         return self.every
 
     @property
+    def lag(self) -> float:
+        """Half a period, and the delay, s."""
+        return (0.5 + self.delay) * self.every
+
+    @property
     def judged(self) -> Literal["torque", "position"]:
         """The same as for the continuous law."""
         return self.law.judged

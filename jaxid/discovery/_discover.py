@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
+from .alongside import along_recorded, in_the_loop
 from .asked import Asked, check_apart
 from .comparison import compare
 from .hypotheses import effect_on
@@ -64,7 +65,8 @@ def discover(
 
     **Arguments:**
 
-    - `loop`: the starting model.
+    - `loop`: the starting model. With more than three joints under a known law, sets of effects are
+      compared along the recorded motion, and the loop is simulated at the end; a note says so.
     - `recordings`: recordings to fit. All recordings have one sample rate.
     - `validate`: held-out recordings. They do not enter the score; they test the final model. If
       None, the model is tested on the fitted recordings only.
@@ -107,22 +109,41 @@ def discover(
             resume, {"loop": loop, "search": asked.plan()}, classes_of(loop) | asked.classes()
         ) as campaign,
     ):
-        search = Search(asked, campaign, say, live_figure(progress))
-        story = _searched(search, loop, started)
-        if story.verdict != "undetermined" or story.interrupted or story.fit.mistake:
+        searched = along_recorded(loop)
+        story = _moving_too(asked, campaign, say, searched, progress, started)
+        if searched is loop or story.interrupted or story.fit.mistake:
             return story
-        slower = worst_at_standstill(story.fit)
-        if slower is None:
-            return story
-        say("the same without standstill, which the model describes worst")
-        moving = dataclasses.replace(loop, standstill=slower)
-        search = Search(asked, campaign, say, live_figure(progress), prefix="moving, ")
-        try:
-            story = _searched(search, moving, started)
-        except KeyboardInterrupt:
-            return dataclasses.replace(story, interrupted=True, reason=_STOPPED)
-        notes = (*story.notes, *slow_note(loop.standstill, moving))
-        return dataclasses.replace(story, notes=notes)
+        say("simulation of the loop")
+        models = [step.fit.loop for step in story.steps]
+        note = in_the_loop(loop, models, held_out or recordings)
+        return dataclasses.replace(story, notes=(*story.notes, note))
+
+
+def _moving_too(
+    asked: Asked,
+    campaign: Campaign,
+    say: Callable[[str], None],
+    loop: ClosedLoop,
+    progress: bool,
+    started: float,
+) -> Discovery:
+    """The result of a search, repeated without standstill if the model describes that worst."""
+    search = Search(asked, campaign, say, live_figure(progress))
+    story = _searched(search, loop, started)
+    if story.verdict != "undetermined" or story.interrupted or story.fit.mistake:
+        return story
+    slower = worst_at_standstill(story.fit)
+    if slower is None:
+        return story
+    say("the same without standstill, which the model describes worst")
+    moving = dataclasses.replace(loop, standstill=slower)
+    search = Search(asked, campaign, say, live_figure(progress), prefix="moving, ")
+    try:
+        story = _searched(search, moving, started)
+    except KeyboardInterrupt:
+        return dataclasses.replace(story, interrupted=True, reason=_STOPPED)
+    notes = (*story.notes, *slow_note(loop.standstill, moving))
+    return dataclasses.replace(story, notes=notes)
 
 
 def _searched(search: Search, loop: ClosedLoop, started: float) -> Discovery:

@@ -1,6 +1,7 @@
 """Release of values held by default: shapes of a sign, a lead of friction, a delay of torque."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Sequence
 
 import equinox as eqx
@@ -12,6 +13,7 @@ from ..simulation.dynamics import imposed
 from ..simulation.integration import SIGNALS
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate_batch
+from ..simulation.steps import set_substeps
 from ..simulation.widening import LEAD, SIGN
 from .predict import Predictor
 from .score import spanned
@@ -209,7 +211,22 @@ def _lateness(predictor: Predictor, nominal: np.ndarray, price: float) -> tuple[
 def _signal(predictor: Predictor, loop: ClosedLoop) -> Float[np.ndarray, "recordings samples n"]:
     """The compared signal of a simulation along the recordings, before the band filter."""
     system = predictor.system
-    return np.asarray(getattr(simulate_batch(loop, system.batch), SIGNALS[system.row]))
+    run = simulate_batch(_finer(loop, system.loop), system.batch)
+    return np.asarray(getattr(run, SIGNALS[system.row]))
+
+
+def _finer(loop: ClosedLoop, before: ClosedLoop) -> ClosedLoop:
+    """The loop with as many more steps as one of its signs is sharper than before."""
+    now = loop.stepping.substeps
+    if now is None:
+        return loop
+    was, new = (
+        [float(p.where(x)) for p in x.parameters if p.place[-1] == "smoothing"]
+        for x in (before, loop)
+    )
+    sharper = [a / max(b, 1e-300) for a, b in zip(was, new, strict=True)]
+    factor = min(max([1.0, *sharper]), _FACTOR)
+    return set_substeps(loop, math.ceil(now * factor), settled=loop.stepping.settled)
 
 
 def _fall(predictor: Predictor, gain: float) -> float:

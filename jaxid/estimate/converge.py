@@ -18,7 +18,15 @@ from ..simulation.batch import Batch, prepare
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate_batch
 from ..simulation.sharing import taken
-from ..simulation.steps import MANY, needed_substeps, refined, set_substeps, sharpest
+from ..simulation.steps import (
+    ACCURATE,
+    HALF_STABLE,
+    MANY,
+    needed_substeps,
+    refined,
+    set_substeps,
+    sharpest,
+)
 from .covariance import Optimum
 from .minimise import Minimum, Point, Problem, Stopping, minimise, reweighted
 from .pieces import (
@@ -217,29 +225,45 @@ def finer_substeps(done: Converged, before: float = np.inf) -> tuple[int | None,
     error = _moved(done, now, 2 * now)
     if not np.isfinite(error) or error <= _ACCURATE or error > _FELL * before:
         return None, error
-    # A method of order p leaves 2⁻ᵖ of its error at half the step.
-    power = 1.2 / (done.loop.stepping.solver.order(None) or 1)
-    return refined(now * (error / _ACCURATE) ** power + 1, done.loop.name), error
+    return refined(_enough(done, error), done.loop.name), error
 
 
-def fewer_substeps(done: Converged, recordings: Recordings, least: float) -> int | None:
+def fewer_substeps(done: Converged, recordings: Recordings, error: float) -> int | None:
     """At most half as many substeps, if they move the torque by at most 1e-4; otherwise None.
 
-    Start values may be stiffer than the optimum, and need more steps.
+    Start values may be stiffer than the optimum, and need more steps. Steps of a quarter of a time
+    constant are also shorter than necessary if the time constant matters for short times only, as
+    that of friction at reversals. Signs that are held may become sharper in later fits, for which
+    stable steps would be too long.
 
     **Arguments:**
 
-    - `least`: relative change of the torque that no step removes.
+    - `error`: relative change of the torque if the steps are halved; infinite if it is not known.
     """
     stepping = done.loop.stepping
     simulated = done.minimum.status.simulated and not isinstance(done.loop.controller, OpenLoop)
     if not simulated or not stepping.settled or stepping.substeps is None or _at_its_sharpest(done):
         return None
-    fewer = needed_substeps(set_substeps(done.loop, None), recordings)
-    if 2 * fewer > stepping.substeps:
+    free, now = {p.place for p in done.loop.free_parameters}, stepping.substeps
+    signs = {p.place for p in done.loop.parameters if p.place[-1] == "smoothing"}
+    longest, least = ACCURATE, 1.0
+    if error <= _ACCURATE and signs <= free:
+        longest, least = HALF_STABLE, _enough(done, error)
+    bare = set_substeps(done.loop, None)
+    fewer = max(needed_substeps(bare, recordings, longest), least)
+    if 2 * fewer > now:
         return None
-    fewer = int(fewer)
-    return fewer if _moved(done, fewer, stepping.substeps) <= max(_ACCURATE, least) else None
+    fewer = math.ceil(fewer)
+    allowed = max(_ACCURATE, error if math.isfinite(error) else 0.0)
+    return fewer if _moved(done, fewer, now) <= allowed else None
+
+
+def _enough(done: Converged, error: float) -> float:
+    """Substeps of which halving moves the torque by 1e-4, from that error at the present number."""
+    now = done.loop.stepping.substeps or 1
+    # A method of order p leaves 2⁻ᵖ of its error at half the step.
+    power = 1.2 / (done.loop.stepping.solver.order(None) or 1)
+    return now * (error / _ACCURATE) ** power + 1
 
 
 def _moved(done: Converged, one: int, other: int) -> float:

@@ -108,7 +108,7 @@ class OEM(AbstractMethod):
                 if not again.minimum.status.simulated:
                     break
                 done = again
-            fewer = fewer_substeps(done, kept, error if math.isfinite(error) else 0.0)
+            fewer = fewer_substeps(done, kept, error)
             if fewer is not None:
                 coarser = set_substeps(done.loop, fewer, settled=True)
                 done = dataclasses.replace(done, loop=coarser)

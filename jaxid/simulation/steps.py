@@ -27,13 +27,24 @@ from .stepping import RK4
 MANY, TOO_MANY = 64, 10_000
 
 
-def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
+# Largest step, in time constants at standstill: one that is accurate before anything is known of
+# the run, and half of what is stable, for a run whose accuracy is known.
+ACCURATE, HALF_STABLE = 0.25, 1.25
+
+
+def with_substeps(
+    loop: ClosedLoop, recordings: Recordings, longest_step: float = ACCURATE
+) -> ClosedLoop:
     """The loop with the number of steps between samples chosen, if the user did not set it.
 
     A step is at most 2.5 ms, and at most a quarter of the fastest time constant at standstill,
     where friction is steepest. It is short enough for a bristle to be stable at speed. Time
     constants do not limit implicit solvers. If an added effect with its own states needs more
     steps, a number chosen before is raised. A step-size controller needs no number.
+
+    **Arguments:**
+
+    - `longest_step`: largest step in fastest time constants at standstill.
 
     **Raises:** `ModelError` if more than 10 000 steps are needed; warns with `JaxidWarning` if more
     than 64 are needed.
@@ -54,18 +65,25 @@ def with_substeps(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     if before is None:
         # For a stiff assumed law the relative error of the torque is about (pace · step)⁴ / 20.
         pace = 7 * loop.controller.pace
-        rate = max(1 / 2.5e-3, still / 0.25, moving / 2, pace)
+        rate = max(1 / 2.5e-3, still / longest_step, moving / 2, pace)
     else:
         rate = max(before / interval, still / 2, moving / 2)
     return set_substeps(loop, steps_at(rate, interval, loop.name), settled=True)
 
 
-def needed_substeps(loop: ClosedLoop, recordings: Recordings) -> float:
-    """Steps between two samples that a loop needs; infinite if they are too many. No warnings."""
+def needed_substeps(
+    loop: ClosedLoop, recordings: Recordings, longest_step: float = ACCURATE
+) -> float:
+    """Steps between two samples that a loop needs; infinite if they are too many. No warnings.
+
+    **Arguments:**
+
+    - `longest_step`: as for `with_substeps`.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", JaxidWarning)
         try:
-            return with_substeps(loop, recordings).stepping.substeps or 1
+            return with_substeps(loop, recordings, longest_step).stepping.substeps or 1
         except ModelError:
             return math.inf
 

@@ -1,0 +1,84 @@
+"""Searches along the recorded motion although the law is known, for arms of many joints."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..control import Tracking
+from ..errors import FitError, ModelError
+from ..recording import Recordings
+from ..simulation.dynamics import imposed
+from ..simulation.loop import ClosedLoop
+from ..simulation.steps import UNROLLED, needed_substeps
+from .comparison import compare
+
+
+def along_recorded(loop: ClosedLoop) -> ClosedLoop:
+    """The loop in which sets of effects are compared: along the recorded motion if it is large.
+
+    One fit of six joints in the simulated loop takes minutes, and a search needs dozens. Below the
+    bandwidth of the law, recorded motion and torque have the same information. The loop is
+    unchanged if it has few joints, if positions are compared, or if its effects have a motion of
+    their own, which only a simulation gives.
+    """
+    law = loop.controller
+    if loop.joints <= UNROLLED or law.imposes or law.judged != "torque":
+        return loop
+    along = dataclasses.replace(loop, controller=Tracking(delay=law.lag))
+    return along if imposed(along) else loop
+
+
+def in_the_loop(loop: ClosedLoop, models: Sequence[ClosedLoop], recordings: Recordings) -> str:
+    """A note with the error of the first and of the last model in the simulated loop.
+
+    **Arguments:**
+
+    - `loop`: the given loop, with its law. `models`: loops along the recorded motion, the starting
+      model first. `recordings`: held-out recordings, if there are any.
+    """
+    said = (
+        f"{loop.name} has {loop.joints} joints, so sets of effects were compared along the "
+        "recorded motion, without the law; in the simulated loop the error of the torque on "
+        f"{', '.join(recordings.names)}, mean over the joints, is"
+    )
+    try:
+        errors = [_error(loop, model, recordings) for model in (models[0], models[-1])]
+    except (FitError, ModelError) as error:
+        return f"{said} not known: {error}"
+    before = f", and {errors[0]:.3g} % of the starting model" if len(models) > 1 else ""
+    return f"{said} {errors[-1]:.3g} %{before}"
+
+
+def _error(given: ClosedLoop, found: ClosedLoop, recordings: Recordings) -> float:
+    """Relative error of a torque under the given law, mean over recordings and joints, %."""
+    loop = dataclasses.replace(
+        found,
+        controller=given.controller,
+        stepping=given.stepping,
+        standstill=given.standstill,
+    )
+    loop = _resolved(loop, recordings)
+    return float(compare(loop, recordings).error_percent.to_numpy().mean())
+
+
+# Steps between two grid points that a simulation may need, and shares of a joint's highest speed to
+# which the smoothing of its signs is raised for that.
+_STEPS, _SHARES = 16, np.geomspace(1e-6, 1e-1, 11)
+
+
+def _resolved(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
+    """The loop with signs of velocity that are smooth enough for fixed steps.
+
+    Along a recorded motion they may be estimated as sharp as the samples can tell, which is zero.
+    """
+    signs = [p for p in loop.parameters if p.place[-1] == "smoothing" and p.joint is not None]
+    speeds = [np.abs(np.diff(r.q, axis=0)).max(axis=0) / r.period for r in recordings]
+    speed = np.max(speeds, axis=0)
+    for share in _SHARES:
+        if needed_substeps(loop, recordings) <= _STEPS:
+            break
+        least = {p.name: share * speed[p.joint - 1] for p in signs if p.joint is not None}
+        values = {p.name: max(float(p.where(loop)), least[p.name]) for p in signs}
+        loop = loop.with_values(**values)
+    return loop
