@@ -191,6 +191,23 @@ def test_a_start_that_is_stiffer_than_the_optimum_costs_no_steps_afterwards():
     assert relative(coarse.tau, exact.tau).max() < 1.1e-4
 
 
+def test_a_stiff_sign_that_is_estimated_needs_few_steps_afterwards():
+    asked = recorded(plain())
+    true = jaxid.scara().with_values(**SCARA_VALUES, eps1=1e-3, eps2=1e-3).free("eps1", "eps2")
+    run = jaxid.simulate(true, asked)[0]
+    record = dataclasses.replace(asked, q=run.q, tau=run.tau)
+    before = with_substeps(true, jaxid.Recordings.of(record)).stepping.substeps
+    method = jaxid.OEM(start="given", progress=False)
+    fit = jaxid.fit(true, record, method=method)
+    assert 2 * fit.loop.stepping.substeps <= before
+    fine = set_substeps(fit.loop, 4 * before)
+    (coarse,), (exact,) = jaxid.simulate(fit.loop, record), jaxid.simulate(fine, record)
+    assert relative(coarse.tau, exact.tau).max() < 1.1e-4
+    # A sign that is held may be released and become sharper, so its steps stay short.
+    held = jaxid.fit(true.hold("eps1", "eps2"), record, method=method)
+    assert held.loop.stepping.substeps == before
+
+
 def test_long_intervals_are_filled_up():
     time = np.concatenate([np.arange(0, 1, 0.01), np.arange(1.5, 3.0, 0.01)])
 

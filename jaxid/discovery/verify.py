@@ -81,22 +81,20 @@ class Refits(eqx.Module):
         - `promised`: predicted decrease of the score.
         """
         loop = of_one_sign(before.loop.add(*map(_inside, effects)))
-        starts = [loop]
+        tried: list[Fit] = []
         held: tuple[str, ...] = ()
         if any(e.finite for e in effects):
-            starts.append(self.unfiltered(loop, noise).loop)
+            tried.append(self.unfiltered(loop, noise))
             held = held_shapes(loop, len(effects))
         if any(e.contact for e in effects):
             for factor in (1.0, _WIDE):
                 scaled = [_inside(e.scaled(factor)) if e.contact else _inside(e) for e in effects]
                 apart = of_one_sign(before.loop.add(*scaled)).free(*held)
-                tried = self.unfiltered(apart, noise)
-                if tried.status.simulated and tried.status is not Status.misfit:
-                    starts.append(tried.loop)
-        found = [self.filtered(start, noise) for start in starts]
-        best = self.best(found)
+                tried.append(self.unfiltered(apart, noise))
+        starts = [loop, *(fit.loop for fit in _promising(before, tried))]
+        best = self.best([self.filtered(start, noise) for start in starts])
         gained = score_of(before).value - score_of(best).value
-        if len(starts) == 1 and not promised / _FAR < gained < promised * _FAR:
+        if not tried and not promised / _FAR < gained < promised * _FAR:
             best = self.best([best, self.filtered(self.unfiltered(loop, noise).loop, noise)])
         for order in (effects, effects[::-1]) if len(effects) > 1 else ():
             if score_of(before).value - score_of(best).value < promised / _FAR:
@@ -129,6 +127,24 @@ class Refits(eqx.Module):
     def best(self, found: Sequence[Fit]) -> Fit:
         """The fit with the lowest score, of several fits of one set of effects."""
         return min(found, key=lambda f: score_of(f).value)
+
+
+def _promising(before: Fit, tried: Sequence[Fit]) -> list[Fit]:
+    """The fits without filters that explain at least half as much as the best one of them.
+
+    A fit takes most of a minute if parts collide. One that ends in another minimum does not leave
+    it because of filters.
+
+    **Arguments:**
+
+    - `before`: the fit without the effects.
+    """
+    usable = [f for f in tried if f.status.simulated and f.status is not Status.misfit]
+    if not usable:
+        return []
+    gained = [score_of(before).value - score_of(f).value for f in usable]
+    least = max(gained) / _FAR if max(gained) > 0 else max(gained)
+    return [f for f, g in zip(usable, gained, strict=True) if g >= least]
 
 
 def quiet(method: OEM) -> OEM:
