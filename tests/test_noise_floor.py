@@ -1,5 +1,7 @@
 """The noise of recorded torque, told without a model of the robot."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import scipy
@@ -111,3 +113,28 @@ def test_a_joint_that_never_moves_freely_tells_nothing():
         # In the second case, samples hardly reach above the motion.
         told = above_motion(jaxid.Recordings.of(record), [cutoff], [moving], [1.0])
         assert told == [(None,)]
+
+
+def test_bursts_of_other_recordings_widen_the_interval():
+    """A recording may have no burst in the windows that are used, and many elsewhere."""
+    inside = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        records, moving, errors = [], [], []
+        for k in range(3):
+            record, _ = axis(seed, level=0.0, name=str(k))
+            speed = np.abs(np.gradient(record.q[:, 0], record.time))
+            used = speed > 0.3 * speed.max()
+            loud = np.repeat(rng.random(len(used) // 50 + 1) < 0.1, 50)[: len(used)]
+            if k == 0:
+                loud &= ~used
+            noise = 0.1 * rng.standard_normal(len(used)) * np.where(loud, 2.5, 0.65)
+            records.append(dataclasses.replace(record, tau=record.tau + noise[:, None]))
+            moving.append(used[:, None])
+            errors.append(float(np.sqrt(np.mean(noise**2))))
+        ((first,), *_) = above_motion(jaxid.Recordings.of(records), [4.0] * 3, moving, [1.0] * 3)
+        if first is not None:
+            assert first.value < errors[0]
+            inside.append(first.low <= errors[0] <= first.high)
+    assert len(inside) >= 10
+    assert np.mean(inside) > 0.9

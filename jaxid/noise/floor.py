@@ -63,8 +63,11 @@ def above_motion(
     for powers in zip(*spectra, strict=True):
         tilts = [_tilt(power) for power in powers]
         flat = _white([t for t in tilts if t is not None])
+        spread = _spread([p for p, t in zip(powers, tilts, strict=True) if t is not None])
         levels = [
-            _level(power, tilt, share) if flat and tilt is not None and _white([tilt]) else None
+            _level(power, tilt, share, spread)
+            if flat and tilt is not None and _white([tilt])
+            else None
             for power, tilt, share in zip(powers, tilts, shares, strict=True)
         ]
         by_joint.append(levels)
@@ -117,19 +120,35 @@ def _white(tilts: Sequence[tuple[float, float]]) -> bool:
 
 
 def _level(
-    power: Float[np.ndarray, "windows bins"], tilt: tuple[float, float], share: float
+    power: Float[np.ndarray, "windows bins"],
+    tilt: tuple[float, float],
+    share: float,
+    spread: float,
 ) -> Level:
-    """Level of white noise from its spectrum in windows."""
-    mean, spread = share * power.mean(), _relative(power.mean(axis=1))
+    """Level of white noise from its spectrum in windows.
+
+    **Arguments:**
+
+    - `spread`: relative deviation of the power of one window.
+    """
+    mean = share * power.mean()
+    # Windows overlap by half.
+    chance = spread / np.sqrt(0.6 * len(power))
     # Includes a possible slope of the spectrum that is too small to be detected.
-    reach = 2 * np.hypot(spread, max(abs(tilt[0]), tilt[1]))
+    reach = 2 * np.hypot(chance, max(abs(tilt[0]), tilt[1]))
     value = np.sqrt(mean)
     return Level(value, value * np.exp(-reach / 2), value * np.exp(reach / 2), "above the motion")
 
 
-def _relative(x: Float[np.ndarray, " windows"]) -> float:
-    """Relative deviation of a mean of windows that overlap by half; allows for bursts."""
-    return float(np.std(x) / (np.mean(x) * np.sqrt(0.6 * len(x))))
+def _spread(powers: Sequence[Float[np.ndarray, "_windows _bins"]]) -> float:
+    """Relative deviation of the power of one window, from all recordings of a joint.
+
+    A recording may have no burst in its few windows without a reversal, but many elsewhere; others
+    of the robot then show that there are bursts.
+    """
+    means = [power.mean(axis=1) for power in powers]
+    around = [np.square(x / x.mean() - 1) for x in means]
+    return float(np.sqrt(np.mean(np.concatenate(around)))) if around else 0.0
 
 
 def from_repeats(recordings: Recordings, compared: Compared) -> dict[str, tuple[Level | None, ...]]:
