@@ -52,6 +52,10 @@ class Examined:
         self.offsets: dict[str, AbstractEffect] = {}
         self.diagnoses: dict[tuple, Diagnosis] = {}
 
+    def note(self, said: str) -> None:
+        """Stores a note for the result, once."""
+        self.failures = tuple(dict.fromkeys((*self.failures, said)))
+
     def visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
         """A fitted model with its score, which is stored and drawn."""
         model = self.judged(effects, fit)

@@ -113,7 +113,7 @@ def _better(
     try:
         fit = fitted()
     except (ModelError, FitError) as error:
-        search.failures = (*search.failures, f"no fit with {listed(effects)}: {error}")
+        search.note(f"no fit with {listed(effects)}: {error}")
         return best
     if not fit.status.simulated:
         return best

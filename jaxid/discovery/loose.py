@@ -74,5 +74,5 @@ def without_loose(search: Examined, at: Model) -> Model | None:
     curve = rivals[0].curve
     assert curve is not None
     said = f"{listed(loose)}: no value is determined; a curve of {curve.label} explains as much"
-    search.failures = (*search.failures, said)
+    search.note(said)
     return part

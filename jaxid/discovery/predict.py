@@ -214,7 +214,7 @@ class Predictor(eqx.Module):
             system.loop, system.batch, [effect, *moved], system.row, nominal
         )
         # A run that diverges has infinite slopes, and its effect is not predicted.
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             columns = [first, *((x - first) / d for x, d in zip(others, by, strict=True))]
         return at_samples(system.batch, np.stack(columns, axis=-1))
 

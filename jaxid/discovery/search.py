@@ -265,13 +265,10 @@ class Search(Examined):
         lacking = unsupported(predictor, c) if imposed(fit.loop) else ()
         if lacking:
             self.without_support |= {c.key}
-            self._note(
+            self.note(
                 f"{listed(lacking)}: does not explain stretches that were left out of its estimate"
             )
         return not lacking
-
-    def _note(self, said: str) -> None:
-        self.failures = tuple(dict.fromkeys((*self.failures, said)))
 
     def _fitted(self, at: Model, asked: Candidate, promised: float) -> Model | None:
         """A full refit with those additional effects that it determines; None if it fails."""
@@ -283,7 +280,7 @@ class Search(Examined):
             fit = self.fits.with_effects(at.fit, at.effects, asked.effects, asked.noise, promised)
         except (ModelError, FitError) as error:
             # The candidate cannot be simulated at the predicted values.
-            self._note(f"no fit with {listed(asked.effects)}: {error}")
+            self.note(f"no fit with {listed(asked.effects)}: {error}")
             return None
         if not fit.status.simulated:
             return None
@@ -291,7 +288,7 @@ class Search(Examined):
         if not loose:
             return self.visit(self.added(fit), fit)
         self.loose |= {asked.key}
-        self._note(f"{listed(asked.effects)}: the fit determines no value of {listed(loose)}")
+        self.note(f"{listed(asked.effects)}: the fit determines no value of {listed(loose)}")
         return with_fewer(self, at, fit, loose)
 
     def _without_one(self, at: Model) -> Model | None:
