@@ -280,3 +280,19 @@ def test_instruments_are_unsure_of_what_they_do_not_see():
     blind = solve(stacked, ("a", "b", "c"), "ordinary", tools)
     assert np.isinf(blind.covariance[2, 2])
     assert len(blind.undetermined) == 1
+
+
+def test_the_cutoff_of_two_recordings_follows_from_both():
+    """One of them has a minimum of its spectrum between reference and response by chance."""
+    pytest.importorskip("mujoco")
+    pytest.importorskip("example_robot_data")
+    from benchmarks import six_joints
+
+    case = six_joints.make(six_joints.draw_wanted(561126, 40, "unknown")[5])
+    one, other, held_out = case.recordings
+    assert signal_cutoff(other) < 3.0 < 15.0 < signal_cutoff(one)
+    assert 15.0 < signal_cutoff(one, other) < 30.0
+    assert 15.0 < signal_cutoff(held_out) < 30.0
+    both = jaxid.control.Tracking().settled([one, other])
+    assert float(both.cutoff) == pytest.approx(signal_cutoff(one, other))
+    assert signal_cutoff(one, one) == signal_cutoff(one)

@@ -32,7 +32,7 @@ class Tracking(AbstractController):
     - `delay`: time by which torque acts later than recorded, s. It is half a period for a law that
       is computed at every sample and held in between.
     - `cutoff`: cutoff of the low-pass, Hz. By default the frequency above which the recorded motion
-      is noise; a fit uses the lowest of its recordings.
+      is noise; a fit determines it from all its recordings.
     """
 
     bandwidth: float = 40.0
@@ -68,8 +68,8 @@ class Tracking(AbstractController):
         return float(self.cutoff or signal_cutoff(recording))
 
     def settled(self, recordings: Iterable[Recording]) -> "Tracking":
-        """The controller with the lowest cutoff of all recordings."""
-        return dataclasses.replace(self, cutoff=min(map(self.comparable, recordings)))
+        """The controller with one cutoff for all recordings."""
+        return dataclasses.replace(self, cutoff=self.cutoff or signal_cutoff(*recordings))
 
     def signals(self, recording: Recording) -> Signals:
         """The low-passed recorded motion, `(samples, joints)`."""

@@ -83,21 +83,42 @@ def smooth_motion(
     return low_pass(q, recording.rate, cutoff, order)
 
 
-def signal_cutoff(recording: Recording) -> float:
-    """The frequency in Hz above which a recorded motion does not determine acceleration.
+def signal_cutoff(*recordings: Recording) -> float:
+    """The frequency in Hz above which recorded motions do not determine acceleration.
 
     The spectrum of the acceleration, f⁴ times that of position, decreases until the encoder's noise
-    raises it again. The result is its minimum, summed over joints relative to their speed. Of
-    minima of about the same level the last is chosen, because another one may be between the
-    frequencies of the reference and those of the loop's response to friction. It is at least five
-    times the frequency of largest speed and at most an eighth of the sample rate. For recordings
-    too short for a spectrum it is a tenth of the sample rate.
+    raises it again. The result is its minimum, summed over joints relative to their speed, and over
+    recordings. Of minima of about the same level the last is chosen, because another one may be
+    between the frequencies of the reference and those of the loop's response to friction. It is at
+    least five times the frequency of largest speed and at most an eighth of the sample rate. For
+    recordings too short for a spectrum it is a tenth of the sample rate.
+    """
+    rate = min(r.rate for r in recordings)
+    long = [r for r in recordings if r.samples >= 200]
+    if not long:
+        return rate / 10
+    # About twenty bands of a third of an octave, because single lines of a spectrum are too noisy.
+    n = min(r.samples for r in long)
+    edges = np.unique(np.round(np.geomspace(4, n // 2, 20)).astype(int)) * (rate / n)
+    parts = [_acceleration(r, edges) for r in long]
+    centre, level = parts[0][0], np.sum([level for _, level in parts], axis=0)
+    least = 5 * centre[int(np.argmax(level / centre**2))]
+    cutoff = centre[_last_minimum(level, centre >= least)]
+    return float(min(max(least, cutoff), rate / 8))
+
+
+def _acceleration(
+    recording: Recording, edges: Float[np.ndarray, " edges"]
+) -> tuple[Float[np.ndarray, " bands"], Float[np.ndarray, " bands"]]:
+    """Mean frequency and power of the acceleration in bands, relative to that of the speed.
+
+    **Arguments:**
+
+    - `edges`: of the bands, Hz.
     """
     import scipy
 
     n, rate = recording.samples, recording.rate
-    if n < 200:
-        return rate / 10
     q = scipy.signal.detrend(resampled(recording.time, recording.q, even_times(recording)), axis=0)
     # The window's side lobes must be below the noise; the motion is 10¹⁰ times as strong.
     window = np.asarray(scipy.signal.get_window("blackmanharris", n))[:, None]
@@ -109,14 +130,10 @@ def signal_cutoff(recording: Recording) -> float:
     moves = rates[f < rate / 10].sum(axis=0) > speed / 2
     chosen = moves if moves.any() else speed > 0
     acceleration = f**4 * (power[:, chosen] / speed[chosen]).sum(axis=1)
-    # About twenty bands of a third of an octave, because single lines of a spectrum are too noisy.
-    edges = np.unique(np.round(np.geomspace(4, n // 2, 20)).astype(int))
-    bands = list(itertools.pairwise(edges))
+    lines = np.searchsorted(f, edges * (1 - 1e-9))
+    bands = list(itertools.pairwise(lines.tolist()))
     centre = np.array([f[low:high].mean() for low, high in bands])
-    level = np.array([acceleration[low:high].mean() for low, high in bands])
-    least = 5 * centre[int(np.argmax(level / centre**2))]
-    cutoff = centre[_last_minimum(level, centre >= least)]
-    return float(min(max(least, cutoff), rate / 8))
+    return centre, np.array([acceleration[low:high].mean() for low, high in bands])
 
 
 # Ratio of the levels of two bands that may be random: a band at low frequencies has few lines.
