@@ -296,3 +296,7 @@ def test_the_cutoff_of_two_recordings_follows_from_both():
     both = jaxid.control.Tracking().settled([one, other])
     assert float(both.cutoff) == pytest.approx(signal_cutoff(one, other))
     assert signal_cutoff(one, one) == signal_cutoff(one)
+    # A shorter recording with another sample rate has fewer frequencies.
+    rows = slice(0, one.samples // 2, 2)
+    short = jaxid.Recording.from_arrays(one.time[rows], one.q[rows], one.tau[rows], name="short")
+    assert 10.0 < signal_cutoff(one, short) <= 125 / 8

@@ -98,10 +98,11 @@ def signal_cutoff(*recordings: Recording) -> float:
     if not long:
         return rate / 10
     # About twenty bands of a third of an octave, because single lines of a spectrum are too noisy.
-    n = min(r.samples for r in long)
-    edges = np.unique(np.round(np.geomspace(4, n // 2, 20)).astype(int)) * (rate / n)
-    parts = [_acceleration(r, edges) for r in long]
-    centre, level = parts[0][0], np.sum([level for _, level in parts], axis=0)
+    apart = max(r.rate / r.samples for r in long)
+    last = int(rate / 2 / apart + 1e-9)
+    edges = np.unique(np.round(np.geomspace(4, last, 20)).astype(int)) * apart
+    centres, levels = zip(*(_acceleration(r, edges) for r in long), strict=True)
+    centre, level = centres[0], np.sum(levels, axis=0)
     least = 5 * centre[int(np.argmax(level / centre**2))]
     cutoff = centre[_last_minimum(level, centre >= least)]
     return float(min(max(least, cutoff), rate / 8))
@@ -110,7 +111,7 @@ def signal_cutoff(*recordings: Recording) -> float:
 def _acceleration(
     recording: Recording, edges: Float[np.ndarray, " edges"]
 ) -> tuple[Float[np.ndarray, " bands"], Float[np.ndarray, " bands"]]:
-    """Mean frequency and power of the acceleration in bands, relative to that of the speed.
+    """Frequency and spectral density of the acceleration in bands, over the power of the speed.
 
     **Arguments:**
 
@@ -133,7 +134,7 @@ def _acceleration(
     lines = np.searchsorted(f, edges * (1 - 1e-9))
     bands = list(itertools.pairwise(lines.tolist()))
     centre = np.array([f[low:high].mean() for low, high in bands])
-    return centre, np.array([acceleration[low:high].mean() for low, high in bands])
+    return centre, n / rate * np.array([acceleration[low:high].mean() for low, high in bands])
 
 
 # Ratio of the levels of two bands that may be random: a band at low frequencies has few lines.
