@@ -9,6 +9,7 @@ from loops import four_joints, scara
 
 import jaxid
 from jaxid.control import PD, OpenLoop, Sampled, Tracking
+from jaxid.discovery import alongside
 from jaxid.discovery.alongside import along_recorded, in_the_loop
 from jaxid.effects import JointElasticity
 
@@ -40,11 +41,27 @@ def test_other_loops_are_unchanged(loop):
     assert along_recorded(loop) is loop
 
 
-def test_the_note_has_the_errors_of_the_simulated_loop():
+def test_an_interrupted_simulation_does_not_lose_the_result(monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(alongside, "compare", interrupted)
+    monkeypatch.setattr(alongside, "needed_substeps", lambda *_: 1)
     loop = jaxid.serial(four_joints(), LAW)
+    note = in_the_loop(loop, [along_recorded(loop)], moving())
+    assert note.endswith("not known: the simulation was interrupted")
+
+
+def moving() -> jaxid.Recordings:
+    """A recording with a reference."""
     time = 0.004 * np.arange(300)
     q = 0.3 * np.sin(np.outer(time, [5.0, 7.0, 9.0, 11.0]) + np.array([0.1, 0.4, 0.9, 1.5]))
-    asked = jaxid.Recording.from_arrays(time, q, q, q_ref=q, name="sines")
+    return jaxid.Recordings.of(jaxid.Recording.from_arrays(time, q, q, q_ref=q, name="sines"))
+
+
+def test_the_note_has_the_errors_of_the_simulated_loop():
+    loop = jaxid.serial(four_joints(), LAW)
+    asked = moving()[0]
     heavy = loop.with_values(Fc1=3.0)
     run = jaxid.simulate(heavy, asked)[0]
     record = jaxid.Recordings.of(dataclasses.replace(asked, q=run.q, tau=run.tau))

@@ -110,16 +110,17 @@ def discover(
         ) as campaign,
     ):
         searched = along_recorded(loop)
-        story = _moving_too(asked, campaign, say, searched, progress, started)
+        story = _with_and_without_standstill(asked, campaign, say, searched, progress, started)
         if searched is loop or story.interrupted or story.fit.mistake:
             return story
         say("simulation of the loop")
         models = [step.fit.loop for step in story.steps]
         note = in_the_loop(loop, models, held_out or recordings)
-        return dataclasses.replace(story, notes=(*story.notes, note))
+        seconds = time.perf_counter() - started
+        return dataclasses.replace(story, notes=(*story.notes, note), seconds=seconds)
 
 
-def _moving_too(
+def _with_and_without_standstill(
     asked: Asked,
     campaign: Campaign,
     say: Callable[[str], None],

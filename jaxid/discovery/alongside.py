@@ -43,11 +43,16 @@ def in_the_loop(loop: ClosedLoop, models: Sequence[ClosedLoop], recordings: Reco
         f"{', '.join(recordings.names)}, mean over the joints, is"
     )
     try:
-        errors = [_error(loop, model, recordings) for model in (models[0], models[-1])]
+        last = _error(loop, models[-1], recordings)
+        before = ""
+        if len(models) > 1:
+            before = f", and {_error(loop, models[0], recordings):.3g} % of the starting model"
     except (FitError, ModelError) as error:
         return f"{said} not known: {error}"
-    before = f", and {errors[0]:.3g} % of the starting model" if len(models) > 1 else ""
-    return f"{said} {errors[-1]:.3g} %{before}"
+    except KeyboardInterrupt:
+        # The search has ended, and its result is kept.
+        return f"{said} not known: the simulation was interrupted"
+    return f"{said} {last:.3g} %{before}"
 
 
 def _error(given: ClosedLoop, found: ClosedLoop, recordings: Recordings) -> float:
@@ -58,7 +63,7 @@ def _error(given: ClosedLoop, found: ClosedLoop, recordings: Recordings) -> floa
         stepping=given.stepping,
         standstill=given.standstill,
     )
-    loop = _resolved(loop, recordings)
+    loop = _softened(loop, recordings)
     return float(compare(loop, recordings).error_percent.to_numpy().mean())
 
 
@@ -67,18 +72,21 @@ def _error(given: ClosedLoop, found: ClosedLoop, recordings: Recordings) -> floa
 _STEPS, _SHARES = 16, np.geomspace(1e-6, 1e-1, 11)
 
 
-def _resolved(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
+def _softened(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:
     """The loop with signs of velocity that are smooth enough for fixed steps.
 
     Along a recorded motion they may be estimated as sharp as the samples can tell, which is zero.
     """
-    signs = [p for p in loop.parameters if p.place[-1] == "smoothing" and p.joint is not None]
     speeds = [np.abs(np.diff(r.q, axis=0)).max(axis=0) / r.period for r in recordings]
-    speed = np.max(speeds, axis=0)
+    highest = np.max(speeds, axis=0)
+    signs = [
+        (p, highest[p.joint - 1])
+        for p in loop.parameters
+        if p.place[-1] == "smoothing" and p.joint is not None
+    ]
     for share in _SHARES:
         if needed_substeps(loop, recordings) <= _STEPS:
             break
-        least = {p.name: share * speed[p.joint - 1] for p in signs if p.joint is not None}
-        values = {p.name: max(float(p.where(loop)), least[p.name]) for p in signs}
+        values = {p.name: max(float(p.where(loop)), share * speed) for p, speed in signs}
         loop = loop.with_values(**values)
     return loop

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..recording import Recording
-from ..signals.smoothing import even_times, signal_cutoff, smooth_motion
+from ..signals.smoothing import even_times, smooth_motion
 from ..signals.standstill import STILL, Standstill
+from ..simulation.batch import motion_cutoff
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from .result import Fit, Status
@@ -151,7 +152,7 @@ def _slow(
 
     - `motions`: speed and distance along each recording.
     """
-    parts, cutoff = [], _cutoff(found)
+    parts, cutoff = [], motion_cutoff(found.loop.controller, found.recordings)
     for recording, at, rest, (speed, away) in zip(
         found.recordings, _compared_samples(found), found.residuals, motions, strict=True
     ):
@@ -162,14 +163,8 @@ def _slow(
 
 def _motions(found: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
     """Speed and distance along each recording, as of `_motion`."""
-    cutoff = _cutoff(found)
+    cutoff = motion_cutoff(found.loop.controller, found.recordings)
     return [_motion(r, cutoff) for r in found.recordings]
-
-
-def _cutoff(found: Fit) -> float:
-    """The frequency up to which the motion of all recordings is known, Hz."""
-    law = found.loop.controller
-    return min(law.comparable(r) or signal_cutoff(r) for r in found.recordings)
 
 
 def _compared_samples(found: Fit) -> list[Int[np.ndarray, " _"]]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..control import Reading, Reference
+from ..control import AbstractController, Reading, Reference
 from ..effects import recording_label
 from ..errors import JaxidError, ModelError, RecordingError
 from ..recording import Recording, Recordings
@@ -326,6 +326,13 @@ def band_of(loop: ClosedLoop, recordings: Recordings | Sequence[Recording]) -> B
     return Band.of(list(recordings), given, longest)
 
 
+def motion_cutoff(law: AbstractController, recordings: Recordings | Sequence[Recording]) -> float:
+    """The frequency up to which the motion of all recordings is known, Hz."""
+    given = [law.comparable(r) for r in recordings]
+    known = [c for c in given if c is not None]
+    return min(known) if known else signal_cutoff(*recordings)
+
+
 def moving_of(
     loop: ClosedLoop, recordings: Recordings | Sequence[Recording], band: Band | None
 ) -> Bool[Array, "recordings rows joints"] | None:
@@ -339,7 +346,7 @@ def moving_of(
     standstill = loop.standstill.settled(loop.joints, law.imposes)
     if not np.any(np.asarray(standstill.still) > 0):
         return None
-    cutoff = min(law.comparable(r) or signal_cutoff(r) for r in recordings)
+    cutoff = motion_cutoff(law, recordings)
     rows = [standstill.moving(r, cutoff) for r in recordings]
     if band is None:
         longest = shared_length(max(r.samples for r in recordings))
