@@ -43,6 +43,8 @@ class Wanted:
     friction: str
     noise: str
     law: str
+    # Joint of the effects, from 1; None for a random one.
+    joint: int | None = None
 
     @property
     def label(self) -> str:
@@ -65,25 +67,38 @@ class Case:
     torques: tuple[dict[str, np.ndarray], ...]
 
 
-def draw_wanted(master: int, count: int, laws: Sequence[str], robot: str = "any") -> list[Wanted]:
-    """`count` cases, each with every law: six of ten with one effect, two of ten clean."""
+def draw_wanted(
+    master: int,
+    count: int,
+    laws: Sequence[str],
+    robot: str = "any",
+    effect: str | None = None,
+    joint: int | None = None,
+    frictions: Sequence[str] = FRICTIONS,
+) -> list[Wanted]:
+    """`count` cases, each with every law: six of ten with one effect, two of ten clean; all of one
+    effect if it is given."""
     rng = np.random.default_rng(master)
     wanted = []
     for number in range(count):
         kind = KINDS[int(rng.choice(4, p=(0.6, 0.1, 0.2, 0.1)))]
+        if effect is not None:
+            kind = "outside" if effect in OUTSIDE else "single"
         chosen = str(rng.choice(ROBOTS)) if robot == "any" else robot
         turns = chosen not in ("axis", "gantry")
         known = [e for e in EFFECTS if turns or e not in TURNING]
         strange = [e for e in OUTSIDE if chosen not in ("axis", "pendulum") or e != "cross_bump"]
         size = {"single": 1, "double": 2, "clean": 0, "outside": 1}[kind]
         names = rng.choice(strange if kind == "outside" else known, size, replace=False).tolist()
+        names = names if effect is None else [effect]
         seed, friction, noise = (
             int(rng.integers(1, 2**31)),
-            str(rng.choice(FRICTIONS)),
+            str(rng.choice(list(frictions))),
             str(rng.choice(NOISES)),
         )
         wanted += [
-            Wanted(number, kind, seed, tuple(names), chosen, friction, noise, law) for law in laws
+            Wanted(number, kind, seed, tuple(names), chosen, friction, noise, law, joint)
+            for law in laws
         ]
     return wanted
 
@@ -160,7 +175,7 @@ def _hidden(rng, wanted, robot, frictions, speed, duration, clean, level) -> tup
     found = []
     for name in wanted.effects:
         places = [j for j, link in enumerate(robot.links) if not (link.slides and name in TURNING)]
-        j = int(rng.choice(places))
+        j = int(rng.choice(places)) if wanted.joint is None else wanted.joint - 1
         shape = draw_shape(rng, name, duration)
         link = robot.links[j]
         effect = Hidden(name, j, frictions[j], link.travel, float(speed[j]), shape, link.slides)

@@ -6,8 +6,8 @@ noise that is white, coloured, heavy-tailed or in bursts. The user has a URDF wh
 by up to a quarter, and knows the law as sampled, takes it for continuous, or does not know it.
 
 python -m benchmarks.worlds [--seed N] [--quick] [--count 40] [--law unknown|sampled|continuous|any]
-                            [--robot NAME] [--jobs 2] [--out DIR] [--json FILE] [--case N]
-                            [--results FILE]
+                            [--robot NAME] [--effect NAME] [--joint N] [--friction NAME ...]
+                            [--jobs 2] [--out DIR] [--json FILE] [--case N] [--results FILE]
 """
 
 import argparse
@@ -29,7 +29,7 @@ import jaxid
 from jaxid.storage.campaign import Campaign, Failed
 
 from ._world_cases import KINDS, LAWS, Case, Wanted, draw_wanted, make, read_case, start_model
-from ._world_physics import ROBOTS
+from ._world_physics import EFFECTS, FRICTIONS, OUTSIDE, ROBOTS
 from ._world_results import append, line_of, origin
 from .hidden_effects import configure_jax, floor_percent
 
@@ -198,6 +198,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--count", type=int, default=40)
     parser.add_argument("--law", choices=(*LAWS, "any"), default="unknown")
     parser.add_argument("--robot", choices=(*ROBOTS, "any"), default="any")
+    parser.add_argument("--effect", choices=(*EFFECTS, *OUTSIDE), help="the same in every case")
+    parser.add_argument("--joint", type=int, help="joint of the effects, from 1; random by default")
+    parser.add_argument("--friction", choices=FRICTIONS, nargs="+", default=FRICTIONS)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, help="folder in which a stopped run continues")
     parser.add_argument("--json", type=Path, help="file for all results")
@@ -210,7 +213,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     seed = drawn if given.seed is None else given.seed
     laws = LAWS if given.law == "any" else (given.law,)
     count, robot = (2, "axis") if given.quick else (given.count, given.robot)
-    cases = draw_wanted(seed, count, laws, robot)
+    same: dict[str, Any] = {"robot": robot, "effect": given.effect, "joint": given.joint}
+    same["frictions"] = tuple(given.friction)
+    cases = draw_wanted(seed, count, laws, **same)
     cases = [w for w in cases if given.case is None or w.number in given.case]
     out = given.out or Path(tempfile.mkdtemp(prefix="worlds_"))
     print(f"seed {seed}, {len(cases)} cases, results in {out}", flush=True)
@@ -218,7 +223,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     records = []
     wanted = {case.label: case for case in cases}
     lines = nullcontext() if given.results is None else given.results.open("w", encoding="utf-8")
-    with Campaign(out, {"seed": seed, "robot": robot}) as campaign, lines as file:
+    with Campaign(out, {"seed": seed, **same}) as campaign, lines as file:
         for label, record in campaign.run(partial(run_case, seed=seed), wanted, jobs=given.jobs):
             if isinstance(record, Failed):
                 failed = {"run": origin(seed), **asdict(wanted[label])}

@@ -73,6 +73,20 @@ class Fits:
             lambda: self._refits.with_effects(before, more, noise, promised),
         )
 
+    def first_with(
+        self,
+        before: Fit,
+        had: Sequence[AbstractEffect],
+        effect: AbstractEffect,
+        noise: Sequence[ARFilter],
+    ) -> Fit:
+        """The fit of a model with an additional effect from one start, assuming white noise.
+
+        **Arguments:** those of `with_effects`.
+        """
+        name, refits = f"{piece_name((*had, effect))}, first", self._refits
+        return self._saved(name, before.loop, lambda: refits.with_one(before.loop, effect, noise))
+
     def exchanged(
         self,
         loop: ClosedLoop,

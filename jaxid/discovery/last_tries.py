@@ -14,6 +14,7 @@ from .explore import DECISIVE, key_of
 from .landscape import form
 from .models import LIKELY, Model, listed
 from .offsets import instead_of_offsets
+from .relevance import loses
 from .signs import reshaped
 from .transmissions import similar_ones, suspected
 from .watched import ROUND
@@ -60,7 +61,8 @@ def with_transmission(search: Examined, at: Model) -> Model | None:
         return None
     diagnosis = search.diagnoses[at.key]
     for effect in suspected(diagnosis):
-        if search.visited.fitted((*at.effects, effect)) is None:
+        tried = search.visited.fitted((*at.effects, effect)) is not None
+        if not tried and _explains_some(search, at, effect):
             best = _better(search, best, (effect,), _added(search, at, effect, at.noise))
     left, screened = diagnosis.depends_on(), [v.hypothesis.effect for v in diagnosis.forms]
     for effect, similar in similar_ones(at.effects, search.asked, screened):
@@ -90,6 +92,24 @@ def without_offset(search: Examined, at: Model) -> Model | None:
             again = partial(search.fits.exchanged, found.loop, effects, effects, found.noise)
             best = _better(search, best, (found.effect,), again)
     return best if best.score < at.score - LIKELY else None
+
+
+def _explains_some(search: Examined, at: Model, effect: AbstractEffect) -> bool:
+    """Whether an effect changes a joint's error by a relevant amount in a first fit, without
+    filters.
+
+    The other fits of a transmission, from further starts and with free shapes, take a minute. Most
+    suspected transmissions are significant because of some other small error of the model.
+    """
+    assert at.fit is not None
+    search.watched.begin("fit", f"first fit with {listed((effect,))}", ROUND)
+    try:
+        fit = search.fits.first_with(at.fit, at.effects, effect, at.noise)
+    except (ModelError, FitError) as error:
+        search.note(f"no fit with {listed((effect,))}: {error}")
+        return False
+    tried = search.judged(search.added(fit), fit)
+    return fit.status.simulated and loses(at, tried, search.asked.worth)
 
 
 def _added(

@@ -113,8 +113,12 @@ class Refits(eqx.Module):
         """
         loop = before.loop
         for effect in effects:
-            loop = self.unfiltered(of_one_sign(loop.add(_inside(effect))), noise).loop
+            loop = self.with_one(loop, effect, noise).loop
         return loop
+
+    def with_one(self, loop: ClosedLoop, effect: AbstractEffect, noise: Sequence[ARFilter]) -> Fit:
+        """The fit of a loop with one more effect under the assumption of white noise."""
+        return self.unfiltered(of_one_sign(loop.add(_inside(effect))), noise)
 
     def unfiltered(self, loop: ClosedLoop, noise: Sequence[ARFilter]) -> Fit:
         """The fit of the loop under the assumption of white noise.
