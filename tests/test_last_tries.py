@@ -13,7 +13,7 @@ from jaxid.discovery.diagnosis import Diagnosis
 from jaxid.discovery.last_tries import replaced, with_transmission
 from jaxid.discovery.models import Model
 from jaxid.discovery.transmissions import similar_ones, suspected
-from jaxid.discovery.verify import held_shapes
+from jaxid.discovery.verify import Refits, held_shapes
 from jaxid.effects import (
     Backlash,
     JointElasticity,
@@ -63,6 +63,22 @@ def test_a_significant_limit_is_fitted_from_one_that_acts():
     found = suspected(diagnosis_of(*verdicts))
     assert found[0] is gap
     assert [(e.joint, float(e.limit)) for e in found[1:]] == [(1, 8.0)]
+
+
+@pytest.mark.xdist_group("offset")
+def test_a_suspected_transmission_that_explains_nothing_has_one_fit(
+    offset_case, offset_story, monkeypatch
+):
+    search, start = search_of(offset_case), offset_story[0].steps[0]
+    at = search.visit((), start.fit)
+    soft = JointElasticity(joint=2, compliance=1e-4, rotor=0.02)
+    verdict = SimpleNamespace(hypothesis=SimpleNamespace(effect=soft, joint=2), p_value=1e-6)
+    search.diagnoses = {at.key: diagnosis_of(verdict)}
+    fits = []
+    monkeypatch.setattr(Refits, "with_effects", lambda *_: pytest.fail("a further fit"))
+    monkeypatch.setattr(Refits, "with_one", lambda *_: fits.append(start.fit) or start.fit)
+    assert with_transmission(search, at) is None
+    assert len(fits) == 1
 
 
 @pytest.mark.slow

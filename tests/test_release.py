@@ -15,7 +15,7 @@ from jaxid.control import Tracking
 from jaxid.discovery.predict import Predictor
 from jaxid.discovery.release import doubtful, released
 from jaxid.discovery.system import System
-from jaxid.effects import Coulomb, TorqueOffset, Viscous, smooth_sign
+from jaxid.effects import Coulomb, Motion, Stribeck, TorqueOffset, Viscous, smooth_sign
 from jaxid.noise import ARFilter
 
 MASS, DRAG, DRY, STIFF = 5.0, 4.0, 3.0, 8.0
@@ -99,6 +99,43 @@ def test_a_wrong_smoothing_is_released():
     assert table.loc["eps1", "value"] == pytest.approx(0.004 * np.arctanh(0.5), rel=0.02)
     assert table.loc["form1", "value"] > 0.95
     assert table.loc["Fc1", "value"] == pytest.approx(DRY, rel=0.01)
+
+
+def test_the_exponent_of_a_stribeck_curve_is_released():
+    """The torque falls as an exponential of speed, not as a Gaussian."""
+    width = 0.004 * np.arctanh(0.5)
+
+    def falls(v):
+        return tanh(v) * (1 + 0.6 * np.exp(-np.abs(v / 0.03)))
+
+    runs = [recorded(1, falls), recorded(2, falls)]
+    frictions = (
+        Coulomb(1, 3.0, smoothing=width, form=1.0),
+        Stribeck(1, 1.0, 0.03, smoothing=width, form=1.0),
+    )
+    loop = axis().without("coulomb").add(*frictions)
+    found = released(predictor(runs, loop), 20.0)
+    assert found is not None
+    assert "ds1" in found.loop.names
+    table = jaxid.fit(found.loop, runs, jaxid.OEM(progress=False)).table()
+    for name, true in (("ds1", 1.0), ("Fs1", 0.6 * DRY), ("vs1", 0.03)):
+        assert table.loc[name, "value"] == pytest.approx(true, abs=5 * table.loc[name, "std"])
+        assert table.loc[name, "std"] < 0.1 * true
+
+
+@pytest.mark.parametrize("exponent", [0.5, 1.0, 2.0])
+def test_a_stribeck_curve_has_its_values_and_derivatives_at_rest(exponent):
+    def torque(exponent, v):
+        zeros, label = jnp.zeros(1), jnp.asarray(0)
+        motion = Motion(jnp.zeros(()), zeros, v[None], zeros, zeros, jnp.zeros(0), label)
+        return Stribeck(1, 2.0, 0.1, exponent, smoothing=0.0).torque(motion)[0]
+
+    fast = torque(exponent, jnp.asarray(0.15))
+    assert float(fast) == pytest.approx(2 * np.exp(-(1.5**exponent)), rel=1e-9)
+    for v in (0.0, 0.15):
+        by_exponent, by_speed = jax.grad(torque, argnums=(0, 1))(exponent, jnp.asarray(v))
+        assert np.isfinite([by_exponent, by_speed]).all()
+    assert float(by_exponent) == pytest.approx(-fast * 1.5**exponent * np.log(1.5), rel=1e-9)
 
 
 def test_a_delay_of_the_torque_is_released():

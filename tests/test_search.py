@@ -15,6 +15,7 @@ from stories import recordings_of, search_of, two_link_of, with_chain
 
 import jaxid
 from jaxid.discovery.bounded import bounded_amplitudes
+from jaxid.discovery.diagnosis import over_recordings
 from jaxid.discovery.explore import Candidate, _fitted, _plain, key_of
 from jaxid.discovery.hypotheses import Hypothesis
 from jaxid.discovery.landscape import Entry, shares_a_joint
@@ -470,3 +471,18 @@ def test_a_filter_does_not_hide_a_wrong_initial_state():
     for r in found.residuals:
         assert np.sqrt(np.mean(r[:8, 1] ** 2)) < 2 * np.std(r[50:, 1])
     np.testing.assert_allclose(found.error_percent, white.error_percent, rtol=0.01)
+
+
+@pytest.mark.xdist_group("offset")
+def test_filters_do_not_take_an_error_of_the_model_for_noise(offset_case, offset_story):
+    """If a joint's error is much larger than before, the fit is repeated without filters."""
+    start = offset_story[0].steps[0].fit
+    refits = Refits(recordings_of(offset_case)[0], jaxid.OEM())
+    error = over_recordings(start.error_percent.to_numpy())
+    noise = tuple(ARFilter(np.array([-0.97]), 1e-4) for _ in range(2))
+    filtered, plain = refits.filtered(start.loop, noise), refits.unfiltered(start.loop, noise)
+    assert not np.allclose(filtered.theta, plain.theta, rtol=1e-3)
+    same = dataclasses.replace(refits, before=error).filtered(start.loop, noise)
+    np.testing.assert_allclose(same.theta, filtered.theta, rtol=1e-9)
+    again = dataclasses.replace(refits, before=error / 2).filtered(start.loop, noise)
+    np.testing.assert_allclose(again.theta, plain.theta, rtol=1e-9)

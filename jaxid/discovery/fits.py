@@ -8,9 +8,14 @@ from ..estimate import Fit
 from ..noise import ARFilter
 from ..simulation.loop import ClosedLoop
 from ..storage.campaign import Campaign
+from .diagnosis import over_recordings
 from .models import piece_name
 from .release import Release
 from .verify import Refits
+
+# Largest number of steps of a fit that only shows whether an effect explains something. One whose
+# values are not determined takes all steps of a usual fit.
+_FEW_STEPS = 25
 
 
 class Fits:
@@ -30,7 +35,8 @@ class Fits:
         A recording along which it diverges is left out from here on.
         """
         first = self._campaign.piece(f"{self._prefix}start", lambda: self._refits.first(loop))
-        self._refits = dataclasses.replace(self._refits, recordings=first.recordings)
+        error = over_recordings(first.error_percent.to_numpy()) if first.status.simulated else None
+        self._refits = dataclasses.replace(self._refits, recordings=first.recordings, before=error)
         return first
 
     def start_filtered(self, first: Fit, noise: Sequence[ARFilter]) -> Fit:
@@ -82,9 +88,13 @@ class Fits:
     ) -> Fit:
         """The fit of a model with an additional effect from one start, assuming white noise.
 
+        It ends after a few steps, converged or not.
+
         **Arguments:** those of `with_effects`.
         """
-        name, refits = f"{piece_name((*had, effect))}, first", self._refits
+        name, method = f"{piece_name((*had, effect))}, first", self._refits.method
+        few = dataclasses.replace(method, max_steps=min(method.max_steps, _FEW_STEPS))
+        refits = dataclasses.replace(self._refits, method=few)
         return self._saved(name, before.loop, lambda: refits.with_one(before.loop, effect, noise))
 
     def exchanged(

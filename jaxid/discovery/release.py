@@ -277,15 +277,16 @@ def doubtful(loop: ClosedLoop) -> list[Parameter]:
 
 
 def _elsewhere(p: Parameter, loop: ClosedLoop) -> list[float]:
-    """Other values to try, within bounds."""
+    """Other values to try, within bounds; near ones as well, for shapes such as an exponent."""
     value = float(np.asarray(p.where(loop)))
     low, high = p.declaration.lower, p.declaration.upper
     if value > 0:
-        tried = value / _FACTOR, value * _FACTOR
+        tried = [value * x for x in (1 / _FACTOR, 0.5, 2.0, _FACTOR)]
     else:
         # A small and a large value: the effect of a change on the residual is not linear.
-        tried = p.declaration.scale / _FACTOR, p.declaration.scale
-    return [x for x in tried if low <= x <= high]
+        tried = [p.declaration.scale / _FACTOR, p.declaration.scale]
+    inside = dict.fromkeys(min(max(x, low), high) for x in tried)
+    return [x for x in inside if x != value]
 
 
 def _white(

@@ -375,7 +375,7 @@ class Discovery(AbstractShown):
             shown = ", ".join(
                 f"{n} {p['value']:.4g}"
                 + (f" ± {p['std']:.2g}" if p["std"] is not None else "")
-                + f" {p['unit']}"
+                + ("" if p["unit"] == "1" else f" {p['unit']}")
                 for n, p in values.items()
             )
             lines.append(f"{step_name(step)}{in_brackets(step.belief())}: {shown}")

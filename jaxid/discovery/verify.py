@@ -13,6 +13,7 @@ from ..noise import ARFilter
 from ..parameters import Bounds, read_values, write_values
 from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
+from .diagnosis import over_recordings
 from .hypotheses import free_of
 from .likelihood import noise_filters, score_of
 from .signs import of_one_sign, reshaped
@@ -28,13 +29,20 @@ _CERTAIN, _RESHAPED = 3.0, 10.0
 _FAR = 2.0
 # Ratio of a residual after the start to the later one above which the initial state is wrong.
 _APART = 3.0
+# Ratio of errors with and without filters above which filters have taken an error of the model for
+# noise.
+_STRAYS = 1.5
 
 
 class Refits(eqx.Module):
-    """Fits on the same recordings by the same method, compared by the same score."""
+    """Fits on the same recordings by the same method, compared by the same score.
+
+    - `before`: relative error by joint of the starting model's fit, %; None before that fit.
+    """
 
     recordings: Recordings
     method: OEM
+    before: Float[np.ndarray, " joints"] | None = None
 
     def first(self, loop: ClosedLoop) -> Fit:
         """The fit of the starting model."""
@@ -46,8 +54,15 @@ class Refits(eqx.Module):
         A filter ignores as many rows after the start as its order. If the residual is large there,
         the initial state is wrong, and the filter may model how it decays. The fit is then repeated
         from one without filters.
+
+        An error of the model that filters take for noise costs little, so the fit can leave more of
+        it than it has to. If a joint's error is much larger than that of the starting model, the
+        fit is repeated without filters.
         """
         found = fit(loop, self.recordings, SeparablePEM(self.given(), filters=tuple(noise)))
+        if found.status.simulated and any(f.order for f in noise) and self._strays(found):
+            plain = self.unfiltered(loop, noise)
+            found = plain if plain.status.simulated else found
         if not found.status.simulated or not _starts_apart(found.residuals, noise):
             return found
         plain = self.unfiltered(found.loop, noise)
@@ -55,6 +70,12 @@ class Refits(eqx.Module):
             return found
         own = SeparablePEM(self.given(), filters=noise_filters(plain.residuals))
         return self.best([found, fit(plain.loop, self.recordings, own)])
+
+    def _strays(self, found: Fit) -> bool:
+        """Whether a joint's error is much larger than that of the starting model."""
+        if self.before is None:
+            return False
+        return bool(np.any(over_recordings(found.error_percent.to_numpy()) > _STRAYS * self.before))
 
     def given(self) -> OEM:
         """The output-error method that starts from the loop's values."""

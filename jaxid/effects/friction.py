@@ -74,14 +74,25 @@ class Coulomb(AbstractEffect):
         return on_joint(self.joint, self.level * sign, motion)
 
 
+# Square of a relative speed at which a power of it still has a derivative by its exponent.
+_STILL = 1e-12
+
+
 class Stribeck(AbstractEffect):
-    """Friction that decreases with speed: Fs exp(-(v/vs)²) sigma(v) (Armstrong-Hélouvry 1991)."""
+    """Friction that decreases with speed: Fs exp(-|v/vs|^δs) sigma(v) (Armstrong-Hélouvry 1991).
+
+    The exponent is held unless freed: 2 is a Gaussian, 1 an exponential (Tustin 1947), and 1/2 was
+    also measured (Bo, Pavelescu 1982).
+    """
 
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     level: Scalar = parameter(0.0, symbol="Fs", unit="N·m", lower=0.0, scale=0.1)
     velocity: Scalar = parameter(
         0.1, symbol="vs", unit="rad/s", lower=1e-4, scale=0.1, linear=False
+    )
+    exponent: Scalar = parameter(
+        2.0, symbol="ds", unit="1", lower=0.4, upper=4.0, scale=1.0, free=False, linear=False
     )
     smoothing: Scalar = smoothing_speed()
     form: Scalar = sign_form()
@@ -102,9 +113,9 @@ class Stribeck(AbstractEffect):
         ]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
-        """Fs exp(-(v/vs)²) sigma(v) on the joint, `(joints,)`."""
+        """Fs exp(-|v/vs|^δs) sigma(v) on the joint, `(joints,)`."""
         v = motion.v[self.joint - 1]
-        fall = jnp.exp(-((v / self.velocity) ** 2))
+        fall = jnp.exp(-(((v / self.velocity) ** 2 + _STILL) ** (self.exponent / 2)))
         return on_joint(
             self.joint, self.level * fall * smooth_sign(v, self.smoothing, self.form), motion
         )
