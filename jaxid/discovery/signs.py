@@ -14,6 +14,8 @@ from ..simulation.widening import SIGN
 OF_SIGN = {(what,) for what in SIGN}
 # Smoothing, rad/s or m/s, and form of the sign of a joint without Coulomb friction.
 _DEFAULT = 0.01, 0.0
+# Relative difference of shapes that changes a fit by less than its deviations.
+_SAME = 0.1
 
 
 def shapes_of_signs(
@@ -43,6 +45,19 @@ def of_one_sign(loop: ClosedLoop) -> ClosedLoop:
         elif p.name not in loop.names:
             held.append((p.name, own))
     return loop.with_values(**{name: estimated[own] for name, own in held if own in estimated})
+
+
+def has_one_sign(loop: ClosedLoop) -> bool:
+    """Whether the frictions of each joint have almost the same sign, where its shape is estimated.
+
+    A fit estimates the shape of the Coulomb friction only.
+    """
+    tied = of_one_sign(loop)
+    for p in loop.parameters:
+        now, own = float(np.sum(p.where(loop))), float(np.sum(p.where(tied)))
+        if abs(now - own) > _SAME * max(abs(now), abs(own), p.declaration.scale * _SAME):
+            return False
+    return True
 
 
 def reshaped(loop: ClosedLoop, effect: AbstractEffect) -> bool:

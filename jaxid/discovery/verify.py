@@ -16,7 +16,7 @@ from ..simulation.loop import ClosedLoop
 from .diagnosis import over_recordings
 from .hypotheses import free_of
 from .likelihood import noise_filters, score_of
-from .signs import of_one_sign, reshaped
+from .signs import has_one_sign, of_one_sign, reshaped
 
 # Factor on the gap at the start of another refit. In a wide gap the link moves freely for longer,
 # so that all parameters of the contact influence the motion.
@@ -29,6 +29,8 @@ _CERTAIN, _RESHAPED = 3.0, 10.0
 _FAR = 2.0
 # Ratio of a residual after the start to the later one above which the initial state is wrong.
 _APART = 3.0
+# Largest number of refits in which frictions take the estimated sign of their joint.
+_SIGN_TURNS = 4
 # Ratio of errors with and without filters above which filters have taken an error of the model for
 # noise.
 _STRAYS = 1.5
@@ -50,6 +52,22 @@ class Refits(eqx.Module):
 
     def filtered(self, loop: ClosedLoop, noise: Sequence[ARFilter]) -> Fit:
         """A fit with noise filters, from the loop's values; efficient for coloured noise.
+
+        Frictions of one joint have one sign. A fit estimates the shape of that of Coulomb friction,
+        so it is repeated with this shape in the others until the shape does not change.
+        """
+        found = self._filtered(loop, noise)
+        for _ in range(_SIGN_TURNS):
+            if not found.status.simulated or has_one_sign(found.loop):
+                break
+            again = self._filtered(of_one_sign(found.loop), noise)
+            if not again.status.simulated or score_of(again).value > score_of(found).value:
+                break
+            found = again
+        return found
+
+    def _filtered(self, loop: ClosedLoop, noise: Sequence[ARFilter]) -> Fit:
+        """A fit with noise filters, repeated without them where they hide an error of the model.
 
         A filter ignores as many rows after the start as its order. If the residual is large there,
         the initial state is wrong, and the filter may model how it decays. The fit is then repeated
