@@ -14,7 +14,9 @@ import jaxid
 from jaxid.control import Tracking
 from jaxid.discovery.predict import Predictor
 from jaxid.discovery.release import doubtful, released
+from jaxid.discovery.signs import has_one_sign, of_one_sign
 from jaxid.discovery.system import System
+from jaxid.discovery.verify import Refits
 from jaxid.effects import Coulomb, Motion, Stribeck, TorqueOffset, Viscous, smooth_sign
 from jaxid.noise import ARFilter
 
@@ -121,6 +123,26 @@ def test_the_exponent_of_a_stribeck_curve_is_released():
     for name, true in (("ds1", 1.0), ("Fs1", 0.6 * DRY), ("vs1", 0.03)):
         assert table.loc[name, "value"] == pytest.approx(true, abs=5 * table.loc[name, "std"])
         assert table.loc[name, "std"] < 0.1 * true
+
+
+@pytest.mark.parametrize("sharp", [0.002, 0.03])
+def test_a_peak_of_friction_has_the_sign_that_is_estimated_beside_it(sharp):
+    """One fit estimates the sign beside a peak that has the sign of the model before."""
+    width, fall = 0.012, 0.05
+
+    def falls(v):
+        return 2 / np.pi * np.arctan(v / width) * (1 + 1.5 * np.exp(-((v / fall) ** 2)))
+
+    runs = jaxid.Recordings.of([recorded(1, falls), recorded(2, falls)])
+    loop = of_one_sign(axis(sharp).free("eps1").add(Stribeck(1, 1.0, 0.03)))
+    once = jaxid.fit(loop, runs, jaxid.OEM(start="given", progress=False))
+    assert not has_one_sign(once.loop)
+    assert abs(once.table().loc["Fs1", "value"] / (1.5 * DRY) - 1) > 0.1
+    noise = [ARFilter(np.zeros(0), 1e-4)]
+    found = Refits(runs, jaxid.OEM(progress=False)).filtered(loop, noise)
+    assert has_one_sign(found.loop)
+    for name, true in (("Fs1", 1.5 * DRY), ("vs1", fall), ("eps1", width)):
+        assert found.table().loc[name, "value"] == pytest.approx(true, rel=0.05)
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 2.0])

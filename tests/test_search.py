@@ -340,7 +340,9 @@ def test_a_search_that_may_add_nothing_says_that_something_is_left(offset_case):
 def test_effects_share_the_sharpness_that_is_estimated_for_their_joint():
     worn = Stribeck(1, 0.0, 0.02, smoothing=0.2)
     loop = jaxid.emps().with_values(eps1=8e-5).add(worn)
-    assert float(of_one_sign(loop).effects[-1].smoothing) == 8e-5
+    assert float(of_one_sign(loop).effects[-1].smoothing) == pytest.approx(8e-5)
+    halfway = of_one_sign(loop, share=0.5).effects[-1].smoothing
+    assert float(halfway) == pytest.approx((0.2 + 8e-5) / 2)
     # What a user has freed, or never asked to estimate, is the user's.
     freed = loop.free("eps1_2")
     assert float(of_one_sign(freed).effects[-1].smoothing) == 0.2

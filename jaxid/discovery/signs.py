@@ -29,10 +29,14 @@ def shapes_of_signs(
     return smoothing, form
 
 
-def of_one_sign(loop: ClosedLoop) -> ClosedLoop:
+def of_one_sign(loop: ClosedLoop, share: float = 1.0) -> ClosedLoop:
     """The loop with one sign per joint, where shapes of that of its Coulomb friction are estimated.
 
     Effects are added with the current shapes, and the refit may change those of the friction.
+
+    **Arguments:**
+
+    - `share`: how far the other shapes move to those of the Coulomb friction.
     """
     estimated, held = {}, []
     for p in loop.parameters:
@@ -43,8 +47,14 @@ def of_one_sign(loop: ClosedLoop) -> ClosedLoop:
         if isinstance(effect, Coulomb) and p.name in loop.names:
             estimated[own] = float(np.asarray(p.where(loop)))
         elif p.name not in loop.names:
-            held.append((p.name, own))
-    return loop.with_values(**{name: estimated[own] for name, own in held if own in estimated})
+            held.append((p.name, own, float(np.asarray(p.where(loop)))))
+    return loop.with_values(
+        **{
+            name: now + share * (estimated[own] - now)
+            for name, own, now in held
+            if own in estimated
+        }
+    )
 
 
 def has_one_sign(loop: ClosedLoop) -> bool:

@@ -30,7 +30,7 @@ _FAR = 2.0
 # Ratio of a residual after the start to the later one above which the initial state is wrong.
 _APART = 3.0
 # Largest number of refits in which frictions take the estimated sign of their joint.
-_SIGN_TURNS = 4
+_SIGN_TURNS = 6
 # Ratio of errors with and without filters above which filters have taken an error of the model for
 # noise.
 _STRAYS = 1.5
@@ -54,13 +54,14 @@ class Refits(eqx.Module):
         """A fit with noise filters, from the loop's values; efficient for coloured noise.
 
         Frictions of one joint have one sign. A fit estimates the shape of that of Coulomb friction,
-        so it is repeated with this shape in the others until the shape does not change.
+        so it is repeated until the others have the same. They move half of the way each time,
+        because a smoother sign of one friction makes that of another one sharper.
         """
         found = self._filtered(loop, noise)
         for _ in range(_SIGN_TURNS):
             if not found.status.simulated or has_one_sign(found.loop):
                 break
-            again = self._filtered(of_one_sign(found.loop), noise)
+            again = self._filtered(of_one_sign(found.loop, share=0.5), noise)
             if not again.status.simulated or score_of(again).value > score_of(found).value:
                 break
             found = again
