@@ -31,7 +31,7 @@ _FAR = 2.0
 _APART = 3.0
 # Largest number of refits in which frictions take the estimated sign of their joint.
 _SIGN_TURNS = 6
-# Ratio of errors with and without filters above which filters have taken an error of the model for
+# Ratio of errors with and without filters above which filters model an error of the model as
 # noise.
 _STRAYS = 1.5
 
@@ -74,7 +74,7 @@ class Refits(eqx.Module):
         the initial state is wrong, and the filter may model how it decays. The fit is then repeated
         from one without filters.
 
-        An error of the model that filters take for noise costs little, so the fit can leave more of
+        An error of the model that filters model as noise costs little, so the fit can leave more of
         it than it has to. If a joint's error is much larger than that of the starting model, the
         fit is repeated without filters.
         """
