@@ -161,12 +161,12 @@ class Refits(eqx.Module):
         return self.unfiltered(of_one_sign(loop.add(_inside(effect))), noise)
 
     def unfiltered(self, loop: ClosedLoop, noise: Sequence[ARFilter]) -> Fit:
-        """The fit of the loop under the assumption of white noise.
+        """The fit of the loop under the assumption of white noise, a start for further fits.
 
         Filters that were estimated without an effect can remove its torque from the comparison. The
         compiled program is that of fits with filters.
         """
-        return self.filtered(loop, [ARFilter(np.zeros(0), f.variance * f.gain) for f in noise])
+        return self._filtered(loop, [ARFilter(np.zeros(0), f.variance * f.gain) for f in noise])
 
     def best(self, found: Sequence[Fit]) -> Fit:
         """The fit with the lowest score, of several fits of one set of effects."""
