@@ -31,6 +31,8 @@ _FAR = 2.0
 _APART = 3.0
 # Largest number of refits in which frictions take the estimated sign of their joint.
 _SIGN_TURNS = 6
+# Decrease of the score by one of them below which the shape of the sign does not matter.
+_LITTLE = 1.0
 # Ratio of errors with and without filters above which filters model an error of the model as
 # noise.
 _STRAYS = 1.5
@@ -62,9 +64,12 @@ class Refits(eqx.Module):
             if not found.status.simulated or has_one_sign(found.loop):
                 break
             again = self._filtered(of_one_sign(found.loop, share=0.5), noise)
-            if not again.status.simulated or score_of(again).value > score_of(found).value:
+            if not again.status.simulated:
                 break
-            found = again
+            gained = score_of(found).value - score_of(again).value
+            found = again if gained > 0 else found
+            if gained < _LITTLE:
+                break
         return found
 
     def _filtered(self, loop: ClosedLoop, noise: Sequence[ARFilter]) -> Fit:
