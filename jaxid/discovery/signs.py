@@ -64,9 +64,10 @@ def has_one_sign(loop: ClosedLoop) -> bool:
     """
     tied = of_one_sign(loop)
     for p in loop.parameters:
-        now, own = float(np.sum(p.where(loop))), float(np.sum(p.where(tied)))
-        if abs(now - own) > _SAME * max(abs(now), abs(own), p.declaration.scale * _SAME):
-            return False
+        if p.place[0] == "effects" and p.place[2:] in OF_SIGN:
+            now, own = (float(np.asarray(p.where(x))) for x in (loop, tied))
+            if abs(now - own) > _SAME * max(now, own, p.declaration.scale * _SAME):
+                return False
     return True
 
 
