@@ -1,4 +1,4 @@
-"""Values that a model holds by default: the smoothing of a sign, its form, a delay of the torque.
+"""Values that a model holds by default: the smoothing of a sign, its form, the lead of friction.
 
 Torque is that of inverse dynamics written out here, along motions in closed form.
 """
@@ -160,13 +160,13 @@ def test_a_stribeck_curve_has_its_values_and_derivatives_at_rest(exponent):
     assert float(by_exponent) == pytest.approx(-fast * 1.5**exponent * np.log(1.5), rel=1e-9)
 
 
-def test_a_delay_of_the_torque_is_released():
-    late = 0.003
+@pytest.mark.parametrize("late", [0.0007, -0.003, 0.015])
+def test_a_fit_estimates_the_delay_of_the_torque(late):
     runs = [recorded(k, arctan, late=late) for k in (1, 2)]
-    found = released(predictor(runs), 20.0)
-    assert found is not None
-    assert found.freedom == 1
-    assert found.loop.controller.delay == pytest.approx(late, rel=0.1)
+    table = jaxid.fit(axis(), runs, jaxid.OEM(progress=False)).table()
+    for name, true in (("delay", late), ("Fv1", DRAG), ("Fc1", DRY), ("M", MASS)):
+        assert table.loc[name, "value"] == pytest.approx(true, abs=3 * table.loc[name, "std"])
+        assert table.loc[name, "std"] < 0.01 * max(abs(true), 0.01)
 
 
 def test_friction_that_precedes_velocity_is_released():

@@ -38,12 +38,14 @@ class Signals(eqx.Module):
     """Inputs of a controller from a recording, at its sample times, `(samples, joints)`.
 
     `hold`: whether they are constant until the next sample, even if the loop interpolates
-    references.
+    references. `late`: time by which they are shifted for a delay of the torque, s; None if the law
+    has no such delay.
     """
 
     q: Float[np.ndarray, "samples joints"]
     tau: Float[np.ndarray, "samples joints"]
     hold: bool = eqx.field(static=True, default=False)
+    late: float | None = None
 
 
 class AbstractController(eqx.Module):
@@ -58,6 +60,11 @@ class AbstractController(eqx.Module):
     def lag(self) -> float:
         """Mean time between a sample and the action of the torque recorded there, s."""
         return (self.period or 0.0) / 2
+
+    @property
+    def late(self) -> Float[Array, ""]:
+        """Time by which torque acts later than recorded, s; only a virtual law has one."""
+        return jnp.zeros(())
 
     def initial_state(self, reading: Reading) -> Float[Array, " states"]:
         """States of the law before the first tick; none by default."""

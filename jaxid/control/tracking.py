@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..parameters import Scalar, as_float64
+from ..parameters import Scalar, as_float64, parameter
 from ..recording import Recording
 from ..signals.smoothing import even_times, resampled, signal_cutoff, smooth_motion
 from ._base import AbstractController, Reading, Reference, Signals
@@ -29,22 +29,27 @@ class Tracking(AbstractController):
 
     - `bandwidth`: bandwidth of the virtual loop, Hz; must be above `cutoff`.
     - `damping`: damping ratio of the virtual loop.
-    - `delay`: time by which torque acts later than recorded, s. It is half a period for a law that
-      is computed at every sample and held in between.
+    - `delay`: time by which torque acts later than recorded, s; estimated by a fit. It is half a
+      period for a law that is computed at every sample and held in between.
     - `cutoff`: cutoff of the low-pass, Hz. By default the frequency above which the recorded motion
       is noise; a fit determines it from all its recordings.
     """
 
     bandwidth: float = 40.0
     damping: float = 1.0
-    # Not static: both are used before any program runs, and programs would depend on them.
+    # Not static: it is used before any program runs, and programs would depend on it.
     cutoff: Scalar | None = eqx.field(converter=as_float64, default=None)
-    delay: Scalar = eqx.field(converter=as_float64, default=0.0)
+    delay: Scalar = parameter(0.0, symbol="delay", unit="s", scale=1e-3, linear=False)
 
     @property
     def pace(self) -> float:
         """Bandwidth of the virtual loop, 1/s."""
         return 2 * math.pi * self.bandwidth
+
+    @property
+    def late(self) -> Float[Array, ""]:
+        """The delay of the torque, s."""
+        return self.delay
 
     @property
     def imposes(self) -> bool:
@@ -75,7 +80,8 @@ class Tracking(AbstractController):
         """The low-passed recorded motion, `(samples, joints)`."""
         smooth = smooth_motion(recording, self.comparable(recording))
         times = even_times(recording)
+        late = float(self.delay)
         # Torque belongs to the motion at the time at which it acts; that is unknown at the end.
-        at = np.clip(recording.time + float(self.delay), times[0], times[-1])
+        at = np.clip(recording.time + late, times[0], times[-1])
         q = resampled(times, smooth, at)
-        return Signals(q, np.zeros_like(recording.tau))
+        return Signals(q, np.zeros_like(recording.tau), late=late)

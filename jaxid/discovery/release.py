@@ -1,6 +1,5 @@
-"""Release of values held by default: shapes of a sign, a lead of friction, a delay of torque."""
+"""Release of values held by default: shapes of effects and a lead of friction."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
 
@@ -21,9 +20,8 @@ from .signs import OF_SIGN, follows
 
 # A positive value is also tried multiplied and divided by this factor.
 _FACTOR = 5.0
-# Largest delay of a torque in samples that a sampled law explains; a larger one is a mistake in the
-# recordings. Smallest change, as a share of a sample or of a scale, for which a fit is made.
-_LATE, _NOTHING = 2.0, 0.02
+# Smallest smoothing, as a share of its scale, from which others are tried.
+_NOTHING = 0.02
 
 
 class Release(eqx.Module):
@@ -31,14 +29,12 @@ class Release(eqx.Module):
 
     - `said`: the released values in words.
     - `gain`: predicted decrease of the score.
-    - `freedom`: number of estimated values that are not parameters of the loop.
     - `again`: whether all values were free before, so that only their start values are new.
     """
 
     loop: ClosedLoop
     said: str
     gain: float
-    freedom: int = 0
     again: bool = False
 
 
@@ -52,47 +48,34 @@ def released(predictor: Predictor, price: float) -> Release | None:
     """
     loop = predictor.system.loop
     nominal = _signal(predictor, loop)
-    values, gains = _shapes(predictor, nominal, price)
-    late, gain = _lateness(predictor, nominal, price)
-    leads = {p.name for p in loop.parameters if p.place[-1] == LEAD} & values.keys()
-    # A lead also explains a part of a sign of the wrong shape, which is released first. A delay of
-    # the torque looks like leads of all frictions, but explains inertia as well.
-    if len(leads) < len(values) or (late and gain > sum(gains[name] for name in leads)):
-        values = {name: value for name, value in values.items() if name not in leads}
-    if values:
-        held = [p.name for p in doubtful(loop) if p.name in values]
-        free = loop.with_values(**values).free(*held)
-        if held:
-            change = _signal(predictor, loop.with_values(**values)) - nominal
-            gain = _fall(predictor, _gain(predictor, _compared(predictor, change)))
-            return Release(free, f"{' and '.join(held)} estimated", gain)
-        start = ", ".join(f"{name} {value:.3g}" for name, value in values.items())
-        least = _fall(predictor, price)
-        return Release(free, f"estimates that begin at {start}", least, again=True)
-    if late == 0:
+    values = _shapes(predictor, nominal, price)
+    if not values:
         return None
-    delay = loop.controller.delay + late  # type: ignore[reportAttributeAccessIssue]
-    law = dataclasses.replace(loop.controller, delay=delay)
-    moved = dataclasses.replace(loop, controller=law)
-    said = f"a delay of the torque of {1e3 * delay:.3g} ms"
-    return Release(moved, said, _fall(predictor, gain), freedom=1)
+    leads = {p.name for p in loop.parameters if p.place[-1] == LEAD} & values.keys()
+    # A lead also explains a part of a sign of the wrong shape, which is released first.
+    if len(leads) < len(values):
+        values = {name: value for name, value in values.items() if name not in leads}
+    held = [p.name for p in doubtful(loop) if p.name in values]
+    free = loop.with_values(**values).free(*held)
+    if held:
+        change = _signal(predictor, loop.with_values(**values)) - nominal
+        gain = _fall(predictor, _gain(predictor, _compared(predictor, change)))
+        return Release(free, f"{' and '.join(held)} estimated", gain)
+    start = ", ".join(f"{name} {value:.3g}" for name, value in values.items())
+    least = _fall(predictor, price)
+    return Release(free, f"estimates that begin at {start}", least, again=True)
 
 
-def _shapes(
-    predictor: Predictor, nominal: np.ndarray, price: float
-) -> tuple[dict[str, float], dict[str, float]]:
+def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str, float]:
     """Start values of the shapes whose change explains more than its price, by name.
 
     Smoothing and form of one sign are changed together, because a fit can replace one by the other.
     The change of the signal by each setting is compared with the residual like the signature of an
     effect.
-
-    **Returns:** the values, and what the change of each explains of the squared error.
     """
     loop = predictor.system.loop
     names = {p.place: p.name for p in loop.parameters}
     found: dict[str, float] = {}
-    gains: dict[str, float] = {}
     tried: set[tuple] = set()
     for p in (*doubtful(loop), *_estimated_signs(loop)):
         together = [names[(*p.place[:2], what)] for what in SIGN if p.place[2:] in OF_SIGN]
@@ -110,8 +93,7 @@ def _shapes(
             if np.isfinite(change).all() and (explained := gain(predictor, change)) > most:
                 best, most = values, explained
         found |= best
-        gains |= dict.fromkeys(best, most)
-    return found, gains
+    return found
 
 
 def _changes(
@@ -189,23 +171,6 @@ def _settings(p: Parameter, together: list[str], loop: ClosedLoop) -> list[dict[
     ]
     now = {smoothing: named[smoothing], form: named[form]}
     return [values for values in chosen if values != now]
-
-
-def _lateness(predictor: Predictor, nominal: np.ndarray, price: float) -> tuple[float, float]:
-    """Estimated delay of the torque, s, and what it explains of the squared error.
-
-    Zero if a law is simulated, or if the delay explains too little, is too small or too large.
-    """
-    system = predictor.system
-    if not imposed(system.loop) or nominal.shape[1] < 3:
-        return 0.0, 0.0
-    time = np.asarray(system.batch.time)
-    step = float(np.median(np.diff(time[0])))
-    rate = _compared(predictor, np.gradient(nominal, step, axis=1))
-    late, gain = _held_against(predictor, rate)
-    delay = late + getattr(system.loop.controller, "delay", 0.0)
-    small = abs(late) < _NOTHING * step
-    return (0.0 if gain < price or small or abs(delay) > _LATE * step else late), gain
 
 
 def _signal(predictor: Predictor, loop: ClosedLoop) -> Float[np.ndarray, "recordings samples n"]:

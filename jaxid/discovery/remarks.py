@@ -7,6 +7,7 @@ import numpy as np
 from ..effects import AbstractEffect, ActuatorLag, TimeDelay
 from ..estimate import Fit
 from ..estimate.standstill import slow_note
+from ..simulation.batch import motion_cutoff
 from ..simulation.loop import ClosedLoop
 from ..simulation.widening import LEAD
 from .hypotheses import effect_on
@@ -28,13 +29,17 @@ def remarks(
     bad = [s.label for s in steps if not s.fit.succeeded]
     said = [f"the fit of {', '.join(bad)} did not converge: use its values with care"]
     last = steps[-1].fit
-    more = (*_estimated(last, given), *_instead(last, given, offsets))
+    more = (*_estimated(last, given), *_delayed(last, given), *_instead(last, given, offsets))
     more = (*more, *slow_note(given.standstill, last.loop), *looks_sampled(last))
     return (*(said if bad else ()), *more)
 
 
-# What the lead of a friction means.
-_LEADS = (
+# What the lead of a friction means: a small one, and one above the time constant of the low-pass.
+_LOW_PASS = (
+    "; the low-pass makes velocity late where friction jumps, by up to {:.2g} ms at this cutoff, "
+    "and the lead corrects this (simulations of a law ignore it)"
+)
+_SOFT = (
     "; friction of simulators with soft constraints precedes velocity, that of real joints does "
     "not: on a measured arm something else is missing (simulations of a law ignore the lead)"
 )
@@ -61,15 +66,45 @@ def _estimated(fit: Fit, given: ClosedLoop) -> list[str]:
                 f"{said} ± {std:.2g}{unit}: these recordings "
                 + ("" if far else "do not ")
                 + f"contradict its default value of {before:.3g}"
-                + (_LEADS if p.place[-1] == LEAD else "")
+                + (_lead(value, fit) if p.place[-1] == LEAD else "")
             )
-    before, after = (getattr(x.controller, "delay", 0.0) for x in (given, fit.loop))
-    if after != before and fit.loop.controller.imposes:
-        way = "later" if after > 0 else "earlier"
-        found.append(
-            f"the recorded torque is estimated to act {1e3 * abs(after):.3g} ms {way} than "
-            "recorded; for a sampled law whose torque is held, it acts half a period later"
-        )
+    return found
+
+
+def _lead(value: float, fit: Fit) -> str:
+    """The cause of a lead of friction over velocity, as the end of a sentence.
+
+    Where friction jumps, acceleration jumps as well. There a low-pass of the position changes the
+    velocity, so that its zero is later than that of the joint.
+    """
+    constant = 1 / (2 * np.pi * motion_cutoff(fit.loop.controller, fit.recordings))
+    return _LOW_PASS.format(1e3 * constant) if value < constant else _SOFT
+
+
+# Largest delay of a torque in samples that a sampled law explains.
+_LATE = 2.0
+
+
+def _delayed(fit: Fit, given: ClosedLoop) -> list[str]:
+    """A note on the delay between torque and motion, if the estimate contradicts the given one."""
+    names = [p.name for p in fit.loop.free_parameters if p.place == ("controller", "delay")]
+    found = []
+    for name in names:
+        value, std = fit.table().loc[name, ["value", "std"]]
+        before = float(given.controller.late)
+        if abs(value - before) > _APART * std:
+            way = "later" if value > 0 else "earlier"
+            sampled = 0 < value <= _LATE * fit.recordings.common_period()
+            found.append(
+                f"the torque is estimated to act {1e3 * abs(value):.3g} ± {1e3 * std:.2g} ms {way} "
+                + ("than recorded" if before == 0 else f"than recorded, not {1e3 * before:.3g} ms")
+                + (
+                    ", as if it is held from one sample to the next"
+                    if sampled
+                    else ", which a sampled law does not explain: check time stamps, and filters "
+                    "on one of the signals"
+                )
+            )
     return found
 
 

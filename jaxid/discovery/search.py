@@ -190,8 +190,6 @@ class Search(Examined):
         if not found.status.simulated:
             return None
         model = self.judged(self.added(found), found)
-        cost = release.freedom * value
-        model = dataclasses.replace(model, score=model.score + cost)
         least = DECISIVE if release.again else max(effect - DECISIVE, 0.0)
         if model.score > at.score - least:
             return None

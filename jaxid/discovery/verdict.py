@@ -225,8 +225,7 @@ def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
             return (
                 f"the residual of {label} suggests that its torque is recorded "
                 f"{1e3 * abs(late):.3g} ms {order} it acts: check time stamps, filters on one of "
-                "the signals and delays of the drive; if the law is unknown, declare the delay by "
-                f"jaxid.control.Tracking(delay={late:.3g})"
+                "the signals and delays of the drive"
             )
     return ""
 

@@ -14,7 +14,7 @@ from ..control import OpenLoop
 from ..noise import ARFilter, Noise, VectorAR
 from ..parameters import Bounds
 from ..recording import Recording, Recordings
-from ..simulation.batch import Batch, prepare
+from ..simulation.batch import Batch, motion_cutoff, prepare
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate_batch
 from ..simulation.sharing import taken
@@ -68,7 +68,7 @@ def converge(
     weights: Float[Array, " outputs"] | None = None,
     batch: Batch | None = None,
 ) -> Converged:
-    """Minimises repeatedly with updated weights and initial states, until they converge.
+    """Minimises repeatedly with updated weights, delay and initial states, until they converge.
 
     **Arguments:**
 
@@ -84,6 +84,8 @@ def converge(
     free, first = map(jax.device_put, (estimated, first_weights(loop, pieces, signals)))
     start = jax.device_put(np.concatenate([batch.q0, batch.v0], axis=1))
     bounds = _resolved(loop, recordings)
+    # From poor start values the delay of the torque may move far, so it is estimated last.
+    held = _delays(loop) & (weights is None and filters is None)
     if weights is None and filters is not None:
         weights = _weights_of(filters, first)
     # For a single output the weight only scales the loss.
@@ -93,16 +95,17 @@ def converge(
     weights = jnp.asarray(first if weights is None else weights)
 
     def posed(weights: Float[Array, " outputs"]) -> Problem:
-        within = bounds.lower, bounds.upper
+        theta = loop.theta
+        within = jnp.where(held, theta, bounds.lower), jnp.where(held, theta, bounds.upper)
         noise = jax.device_put(_taps(filters, weights))
         kinds = signals, bool(estimated.any()), method.mesh
         mix = _mix(filters, weights)
         return Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix)
 
-    total, minimum, problem, ratio = 0, None, posed(weights), jnp.ones_like(first)
+    total, minimum, problem, ratio, again = 0, None, posed(weights), jnp.ones_like(first), False
     for _ in range(20):
         left = method.max_steps - total
-        known = None if minimum is None else reweighted(problem, minimum.point, ratio)
+        known = None if minimum is None or again else reweighted(problem, minimum.point, ratio)
         settings = Stopping(method.tolerance, worth, left, deadline, method.solver)
         minimum = minimise(problem, loop.theta, start, settings, say, known)
         total += minimum.iterations
@@ -117,11 +120,16 @@ def converge(
             minimum = dataclasses.replace(minimum, status=Status.converged)
         settled = bool(np.all(np.abs(np.asarray(new) / np.asarray(weights) - 1) < 0.1))
         ended = total >= method.max_steps or minimum.status is Status.max_seconds
-        if ended or (settled and worth < 1e-2):
+        shifted = _shifted(loop, batch, pieces)
+        again, held = bool(held.any()) or shifted, np.zeros_like(held)
+        if ended or (settled and worth < 1e-2 and not again):
             break
+        if shifted:
+            batch = prepare(loop, pieces)
+            start = jax.device_put(np.concatenate([batch.q0, batch.v0], axis=1))
         ratio, weights, worth = new / weights, new, 1e-4 if settled else worth
         problem = posed(weights)
-        if alone:
+        if alone and not again:
             there = reweighted(problem, minimum.point, ratio)
             minimum = dataclasses.replace(minimum, point=there)
             break
@@ -136,6 +144,26 @@ def converge(
         signals=signals,
         iterations=total,
     )
+
+
+# Largest change of a delay for which the cubics of a reference are evaluated outside of their
+# intervals, as a share of a radian at the cutoff: acceleration then is right to a thousandth.
+_SHIFTED = 0.04
+
+
+def _delays(loop: ClosedLoop) -> Bool[np.ndarray, " parameters"]:
+    """Which free parameters are a delay of the torque."""
+    free = loop.free_parameters
+    delays = [p.place == ("controller", "delay") for p in free for _ in range(p.size)]
+    return np.array(delays, bool) & loop.controller.imposes
+
+
+def _shifted(loop: ClosedLoop, batch: Batch, recordings: Sequence[Recording]) -> bool:
+    """Whether the delay of the torque has changed so much that the reference is shifted again."""
+    if batch.intervals.late is None:
+        return False
+    change = np.abs(float(loop.controller.late) - np.asarray(batch.intervals.late)).max()
+    return bool(2 * np.pi * motion_cutoff(loop.controller, recordings) * change > _SHIFTED)
 
 
 def _resolved(loop: ClosedLoop, recordings: Recordings) -> Bounds:

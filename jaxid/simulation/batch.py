@@ -26,6 +26,8 @@ class Interval(eqx.Module):
     the signals that are constant in the interval, by name, `(joints,)` each. `noise` and `rate` are
     added to the position and velocity that the sensors read, `push` and `pull` to the torque on
     drives and links. Each of the four is given at both ends and is linear in between, or is None.
+    `late` is the part of the delay of the torque by which the reference is shifted already, s; None
+    if the law has no delay.
     """
 
     t0: Float[Array, ""]
@@ -39,6 +41,7 @@ class Interval(eqx.Module):
     rate: Float[Array, "2 joints"] | None = None
     push: Float[Array, "2 joints"] | None = None
     pull: Float[Array, "2 joints"] | None = None
+    late: Float[Array, ""] | None = None
 
 
 class Batch(eqx.Module):
@@ -159,6 +162,9 @@ def _drive(
         {name: padded(x) for name, x in held_at(recording, grid, held).items()},
         ends,
         rate,
+        None,
+        None,
+        None if signals.late is None else np.full(length, signals.late),
     )
 
 

@@ -1,0 +1,57 @@
+"""Notes on values that a fit along the recorded motion estimated."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from test_release import arctan, axis, recorded
+
+import jaxid
+from jaxid.discovery.remarks import remarks
+from jaxid.discovery.step import Step
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """A fit with a free lead of friction, whose values tests replace."""
+    return jaxid.fit(axis().free("lead1"), recorded(1, arctan), jaxid.OEM(progress=False))
+
+
+def notes(fit, given=None, **values):
+    """The notes on a fit with other values and deviations of a hundredth of a millisecond."""
+    loop = fit.loop.with_values(**{"delay": 0.0, "lead1": 0.0, **values})
+    covariance = 1e-10 * np.eye(len(fit.names))
+    found = dataclasses.replace(fit, loop=loop, covariance=covariance)
+    return " | ".join(remarks([Step("start", found, None, None)], given or axis(), {}))
+
+
+@pytest.mark.parametrize(
+    ("delay", "said", "unusual"),
+    [
+        (0.0005, "act 0.5 ± 0.01 ms later than recorded, as if it is held", False),
+        # Three samples of 4 ms.
+        (0.012, "act 12 ± 0.01 ms later than recorded, which a sampled law does not", True),
+        (-0.001, "act 1 ± 0.01 ms earlier than recorded, which a sampled law does not", True),
+    ],
+)
+def test_a_delay_is_told_with_its_cause(fitted, delay, said, unusual):
+    told = notes(fitted, delay=delay)
+    assert said in told
+    assert ("check time stamps" in told) == unusual
+
+
+def test_a_delay_as_given_is_not_told(fitted):
+    assert "estimated to act" not in notes(fitted, delay=2e-5)
+    given = axis().with_values(delay=0.0005)
+    assert "estimated to act" not in notes(fitted, given, delay=0.0005)
+    assert "2 ± 0.01 ms later than recorded, not 0.5 ms" in notes(fitted, given, delay=0.002)
+
+
+def test_a_lead_below_the_time_constant_of_the_low_pass_is_its_work(fitted):
+    # The cutoff of the axis is 20 Hz, so the time constant is 8 ms.
+    told = notes(fitted, lead1=0.005)
+    assert "by up to 8 ms at this cutoff" in told
+    assert "soft constraints" not in told
+    told = notes(fitted, lead1=0.0095)
+    assert "soft constraints" in told
+    assert "at this cutoff" not in told
