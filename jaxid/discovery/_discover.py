@@ -25,6 +25,7 @@ from .landscape import form
 from .models import Model, Named, named, probability, worth_keeping
 from .remarks import remarks
 from .search import Search
+from .shapes import with_shapes
 from .step import Step
 from .story import Discovery
 from .text import joined
@@ -176,6 +177,8 @@ def _told(
     elif not unfinished and not reason:
         alike = {named(s.added): s.alike for s in steps if s.added is not None}
         reason = undecided(models, search.at, alike)
+    if not interrupted and not reason and search.at.effects:
+        steps = _with_shapes(search, steps)
     notes = (*remarks(steps, search.given, search.offsets), *search.failures)
     if unfinished:
         notes = (f"stopped at the limit of {search.asked.most} effects: raise most", *notes)
@@ -190,6 +193,25 @@ def _told(
         unfinished=unfinished,
         interrupted=interrupted,
     )
+
+
+def _with_shapes(search: Search, steps: Sequence[Step]) -> list[Step]:
+    """The steps, the last one with the shapes of added effects estimated.
+
+    The tests of the model are those with the shapes held: beside a free shape the size of an effect
+    can be uncertain although the effect is not.
+    """
+    search.watched.begin("fit", "fits with the shapes of added effects free")
+    last, held_out = steps[-1], search.asked.held_out
+    try:
+        fit = with_shapes(search.fits, search.at)
+    except KeyboardInterrupt:
+        search.note("held shapes of the added effects were not estimated: interrupted")
+        return list(steps)
+    if fit is not last.fit:
+        held = None if held_out is None else compare(fit, held_out)
+        last = dataclasses.replace(last, fit=fit, held_out=held)
+    return [*steps[:-1], last]
 
 
 def _stopped_short(most: int) -> str:

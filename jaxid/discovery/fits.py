@@ -58,6 +58,20 @@ class Fits:
         name = f"{piece_name(effects)}, {release.said}"
         return self._saved(name, loop, lambda: self._refits.filtered(loop, noise))
 
+    def with_shapes(
+        self, effects: Sequence[AbstractEffect], start: ClosedLoop, noise: Sequence[ARFilter]
+    ) -> Fit:
+        """The fit of a model whose effects' shapes are free, from the values of a loop.
+
+        **Arguments:**
+
+        - `effects`: its effects over the starting model.
+        """
+        free = [p for p in start.free_parameters if not p.declaration.free]
+        at = ", ".join(f"{p.name} {float(p.where(start)):.6g}" for p in free)
+        name = f"{piece_name(effects)}, from {at}"
+        return self._saved(name, start, lambda: self._refits.filtered(start, noise))
+
     def with_effects(
         self,
         before: Fit,
@@ -131,10 +145,8 @@ class Fits:
 
         - `loop`: the loop before the fit.
         """
-        late = getattr(loop.controller, "delay", 0.0)
         parts = [f"{x} free" for x in sorted(released_names(loop))]
         parts += [f"{x} held" for x in sorted(loop.held_names)]
-        parts += [f"delay {late:.9g}"] if late else []
         return self._campaign.piece(", ".join([f"{self._prefix}{name}", *parts]), work)
 
 

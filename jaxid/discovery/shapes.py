@@ -1,0 +1,106 @@
+"""Shapes that added effects hold by default, estimated when a search has ended."""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..estimate import Fit, Status
+from ..parameters import Parameter
+from ..simulation.dynamics import imposed
+from ..simulation.loop import ClosedLoop
+from ..simulation.widening import LEAD, SIGN
+from .fits import Fits
+from .likelihood import score_of, weights
+from .models import Model
+from .release import doubtful
+
+# Other start values of a shape relative to its value, and of the form of a sign.
+_SHARES, _FORMS = (1.0, 0.5), (0.0, 1.0)
+# Largest distance in deviations between two fits in the same minimum.
+_SAME = 0.5
+# Smallest weight of a minimum that is mentioned.
+_SHOWN = 0.05
+
+
+def with_shapes(fits: Fits, at: Model) -> Fit:
+    """The fit of the final model with the shapes of its added effects estimated.
+
+    A search compares effects with their shapes held at defaults, such as the exponent of a Stribeck
+    curve. The deviations of such a fit do not contain the uncertainty of the shape. With the shape
+    free, sign and peak of a friction can replace each other, so there may be several minima with
+    similar errors. The fit therefore starts from several shapes. Its deviations contain the spread
+    of the minima, weighed by their scores (law of total variance; Madigan and Raftery 1994).
+
+    Only along an imposed motion, where such fits take seconds.
+
+    **Returns:** the fit of the model itself if no shape is held, or if no such fit succeeds.
+    """
+    assert at.fit is not None
+    loop = at.fit.loop
+    held = _held_shapes(loop, len(at.effects))
+    if not held or not imposed(loop):
+        return at.fit
+    found = [fits.with_shapes(at.effects, start, at.noise) for start in _starts(loop, held)]
+    sound = [f for f in found if f.status.simulated and f.status is not Status.misfit]
+    return _merged(sound) if sound else at.fit
+
+
+def _held_shapes(loop: ClosedLoop, added: int) -> list[Parameter]:
+    """Shapes of the last effects of a loop that are held by declaration."""
+    first = len(loop.effects) - added
+    return [
+        p
+        for p in doubtful(loop)
+        if int(p.place[1]) >= first
+        and p.place[-1] not in (*SIGN, LEAD)
+        and np.isfinite(p.where(loop))
+    ]
+
+
+def _starts(loop: ClosedLoop, held: Sequence[Parameter]) -> list[ClosedLoop]:
+    """The loop with held shapes free, at other values of one of them and of its joint's form."""
+    loop = loop.free(*[p.name for p in held])
+    found: dict[tuple, ClosedLoop] = {}
+    for p in held:
+        forms = [q for q in loop.free_parameters if q.place[-1] == SIGN[1] and q.joint == p.joint]
+        value = float(np.asarray(p.where(loop)))
+        choices = [[value * share for share in _SHARES], *(_FORMS for _ in forms)]
+        for values in itertools.product(*choices):
+            names = [q.name for q in (p, *forms)]
+            start = loop.with_values(**dict(zip(names, values, strict=True)))
+            found.setdefault(tuple(start.theta.tolist()), start)
+    return list(found.values())
+
+
+def _merged(found: Sequence[Fit]) -> Fit:
+    """The fit with the lowest score, with deviations that contain the spread of all minima."""
+    best, *others = sorted(found, key=lambda f: score_of(f).value)
+    minima = [best]
+    for fit in others:
+        if not any(_same(fit, other) for other in minima):
+            minima.append(fit)
+    share = weights([score_of(f).value for f in minima])
+    # The minimum with the lowest score gives the values; the others are at a distance from it.
+    covariance = sum(
+        weight * (f.covariance + np.outer(f.theta - best.theta, f.theta - best.theta))
+        for weight, f in zip(share, minima, strict=True)
+        if weight > 0
+    )
+    notes, near = best.notes, int(np.sum(share > _SHOWN))
+    if near > 1:
+        said = (
+            f"{near} sets of values explain these recordings almost equally well; the best one is "
+            "given, and deviations contain the distance to the others"
+        )
+        notes = (*notes, said)
+    return dataclasses.replace(best, covariance=np.asarray(covariance), notes=notes)
+
+
+def _same(one: Fit, other: Fit) -> bool:
+    """Whether two fits of one model are in the same minimum."""
+    std = np.minimum(one.std, other.std)
+    known = np.isfinite(std) & (std > 0)
+    apart = np.abs(one.theta - other.theta)[known]
+    return bool(np.all(apart <= _SAME * std[known]))
