@@ -203,6 +203,14 @@ class Law:
     cutoff: float = 150.0
 
 
+# Distance from the reference at which a law does not control its arm, rad or m.
+_LOST = 0.5
+
+
+class Unstable(ValueError):
+    """A drawn law that does not stabilise its arm."""
+
+
 @dataclass(frozen=True)
 class Run:
     """At 1 kHz, `(ticks, joints)`: encoders, reference, commanded torque, and torque of the hidden
@@ -224,7 +232,10 @@ def simulate(
     resolution: float,
     duration: float,
 ) -> Run:
-    """A run from rest under PD with an integral at 1 kHz; torque is held between its ticks."""
+    """A run from rest under PD with an integral at 1 kHz; torque is held between its ticks.
+
+    **Raises:** `Unstable` if a joint does not follow its reference.
+    """
     model = plant.model()
     data = mujoco.MjData(model)
     data.qpos[:] = home
@@ -262,8 +273,9 @@ def simulate(
                 rest = data.qfrc_passive - model.dof_armature * data.qacc
                 through = (net + rest + data.qfrc_constraint).tolist()
     arrays = {name: np.array(row) for name, row in rows.items()}
-    if not all(np.isfinite(x).all() for x in arrays.values()):
-        raise ValueError("the simulation diverged")
+    apart = np.abs(arrays["q"] - arrays["q_ref"]).max()
+    if not apart < _LOST or not all(np.isfinite(x).all() for x in arrays.values()):
+        raise Unstable(f"a joint is {apart:.2g} rad or m away from its reference")
     return Run(np.arange(ticks) * TICK, **arrays, law=law)
 
 
