@@ -94,7 +94,7 @@ def converge(
     worth = 1e-4 if alone or weights is not None else 1e-2
     weights = jnp.asarray(first if weights is None else weights)
 
-    def posed(weights: Float[Array, " outputs"]) -> Problem:
+    def posed(weights: Float[Array, " outputs"], batch: Batch) -> Problem:
         theta = loop.theta
         within = jnp.where(held, theta, bounds.lower), jnp.where(held, theta, bounds.upper)
         noise = jax.device_put(_taps(filters, weights))
@@ -102,7 +102,13 @@ def converge(
         mix = _mix(filters, weights)
         return Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix)
 
-    total, minimum, problem, ratio, again = 0, None, posed(weights), jnp.ones_like(first), False
+    total, minimum, problem, ratio, again = (
+        0,
+        None,
+        posed(weights, batch),
+        jnp.ones_like(first),
+        False,
+    )
     for _ in range(20):
         left = method.max_steps - total
         known = None if minimum is None or again else reweighted(problem, minimum.point, ratio)
@@ -128,7 +134,7 @@ def converge(
             batch = prepare(loop, pieces)
             start = jax.device_put(np.concatenate([batch.q0, batch.v0], axis=1))
         ratio, weights, worth = new / weights, new, 1e-4 if settled else worth
-        problem = posed(weights)
+        problem = posed(weights, batch)
         if alone and not again:
             there = reweighted(problem, minimum.point, ratio)
             minimum = dataclasses.replace(minimum, point=there)
