@@ -102,13 +102,8 @@ def converge(
         mix = _mix(filters, weights)
         return Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix)
 
-    total, minimum, problem, ratio, again = (
-        0,
-        None,
-        posed(weights, batch),
-        jnp.ones_like(first),
-        False,
-    )
+    total, minimum, ratio, again = 0, None, jnp.ones_like(first), False
+    problem = posed(weights, batch)
     for _ in range(20):
         left = method.max_steps - total
         known = None if minimum is None or again else reweighted(problem, minimum.point, ratio)
