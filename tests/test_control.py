@@ -247,16 +247,20 @@ def test_tracking_torque_is_that_of_inverse_dynamics(tracked):
         assert np.all(error < (0.002, 0.01))
 
 
-def test_tracking_a_torque_that_acts_later_shifts_its_motion():
-    record, late = recorded(pd_run()), 0.005
-    (now,) = jaxid.simulate(scara_under(Tracking(cutoff=20.0)), record)
-    (then,) = jaxid.simulate(scara_under(Tracking(cutoff=20.0, delay=late)), record)
-    spline = scipy.interpolate.CubicSpline(record.time, now.tau)
-    expected = spline(record.time + late)[INSIDE]
-    # But for the few samples beside a jump of friction, which a spline does not follow.
-    left = np.median(np.abs(np.asarray(then.tau)[INSIDE] - expected), axis=0)
-    assert np.all(left < 1e-4 * np.abs(expected).max(axis=0))
-    assert np.all(np.median(np.abs(now.tau[INSIDE] - expected), axis=0) > 20 * left)
+@pytest.mark.parametrize("late", [0.0007, 0.005, -0.012])
+def test_the_delay_of_a_virtual_law_shifts_the_measured_torque(late):
+    record = recorded(pd_run())
+    laws = Tracking(cutoff=20.0), Tracking(cutoff=20.0, delay=late)
+    now, then = (jaxid.compare(scara_under(law), record).judged() for law in laws)
+    sections = scipy.signal.butter(4, 20.0, fs=record.rate, output="sos")
+    smooth = scipy.signal.sosfiltfilt(sections, record.tau, axis=0)
+    expected = scipy.interpolate.CubicSpline(record.time, smooth)(then[0] - late)
+    # The two filters differ at the ends of a recording; rows of a joint at rest are zero.
+    away = (then[1] != 0) & ((then[0] > 0.4) & (then[0] < 1.6))[:, None]
+    left = np.where(away, np.abs(then[1] - expected), 0.0)
+    assert np.all(left < 1e-3 * np.abs(expected).max(axis=0))
+    assert away.sum() > 50
+    np.testing.assert_array_equal(then[2], now[2])
 
 
 def test_tracking_needs_no_reference_and_takes_uneven_time():

@@ -230,3 +230,21 @@ def test_where_a_joint_stands_still_its_torque_is_not_compared():
     fit = jaxid.fit(loop, record, jaxid.OEM(progress=False))
     still = np.mean(np.concatenate(fit.residuals) == 0)
     assert 0.5 < still < 0.7
+
+
+def test_a_fit_that_ends_at_a_jump_is_repeated_from_a_usual_sign():
+    def root(v):
+        return v / np.sqrt(v**2 + 0.002**2)
+
+    refits = Refits(jaxid.Recordings.of([recorded(k, root) for k in (1, 2)]), jaxid.OEM())
+    noise = [ARFilter(np.zeros(0), 1e-4)]
+    jumps = axis(smoothing=0.0).free("eps1", "form1").with_values(form1=1.5, Fc1=DRY, Fv1=DRAG)
+    stuck = jaxid.fit(
+        jumps, refits.recordings, jaxid.SeparablePEM(refits.given(), filters=tuple(noise))
+    )
+    assert stuck.table().loc["eps1", "value"] < 1e-6
+    found = refits.filtered(jumps, noise)
+    assert np.all(found.error_percent < 0.6 * stuck.error_percent)
+    table = found.table()
+    for name, true in (("form1", 0.5), ("Fc1", DRY), ("Fv1", DRAG)):
+        assert table.loc[name, "value"] == pytest.approx(true, abs=4 * table.loc[name, "std"])

@@ -38,14 +38,12 @@ class Signals(eqx.Module):
     """Inputs of a controller from a recording, at its sample times, `(samples, joints)`.
 
     `hold`: whether they are constant until the next sample, even if the loop interpolates
-    references. `late`: time by which they are shifted for a delay of the torque, s; None if the law
-    has no such delay.
+    references.
     """
 
     q: Float[np.ndarray, "samples joints"]
     tau: Float[np.ndarray, "samples joints"]
     hold: bool = eqx.field(static=True, default=False)
-    late: float | None = None
 
 
 class AbstractController(eqx.Module):

@@ -23,7 +23,8 @@ class Tracking(AbstractController):
     simulated and feedback corrects the deviation. Simulated and measured torque can be compared if
     both loops track equally well (Gautier, Janot, Vandanjon 2013). The recorded motion is
     low-passed forward and backward before differentiation. The same filter is applied to measured
-    and simulated torque before they are compared (the parallel filter of Gautier 1997).
+    and simulated torque before they are compared (the parallel filter of Gautier 1997). The delay
+    shifts the measured torque there; simulated torque is that at the time at which it acts.
 
     **Arguments:**
 
@@ -79,9 +80,5 @@ class Tracking(AbstractController):
     def signals(self, recording: Recording) -> Signals:
         """The low-passed recorded motion, `(samples, joints)`."""
         smooth = smooth_motion(recording, self.comparable(recording))
-        times = even_times(recording)
-        late = float(self.delay)
-        # Torque belongs to the motion at the time at which it acts; that is unknown at the end.
-        at = np.clip(recording.time + late, times[0], times[-1])
-        q = resampled(times, smooth, at)
-        return Signals(q, np.zeros_like(recording.tau), late=late)
+        q = resampled(even_times(recording), smooth, recording.time)
+        return Signals(q, np.zeros_like(recording.tau))

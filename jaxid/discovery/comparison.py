@@ -78,8 +78,9 @@ class Comparison(AbstractShown):
         if self.signal == "position":
             return record.time, record.q, np.asarray(run.q)
         band = band_of(self.loop, self.recordings)
-        pair = [r.tau for r in self.recordings], [np.asarray(x.tau) for x in self.runs]
-        measured, simulated = (compared(self.loop, self.recordings, x)[k] for x in pair)
+        loop, records = self.loop, self.recordings
+        measured = compared(loop, records, [r.tau for r in records], loop.controller.late)[k]
+        simulated = compared(loop, records, [np.asarray(x.tau) for x in self.runs])[k]
         if band is None:
             return record.time, measured, simulated
         rows = np.asarray(band.rows)[k][np.asarray(band.keep)[k]]
@@ -297,8 +298,9 @@ def _errors(
         [np.asarray(v) - np.asarray(run.v) for v, run in zip(velocity, runs, strict=True)],
     )
     if not isinstance(loop.controller, OpenLoop):
-        torque = compared(loop, recordings, [r.tau for r in recordings])
-        left = compared(loop, recordings, [r.tau - np.asarray(run.tau) for r, run in pairs])
+        torque = compared(loop, recordings, [r.tau for r in recordings], loop.controller.late)
+        simulated = compared(loop, recordings, [np.asarray(run.tau) for run in runs])
+        left = [x - y for x, y in zip(torque, simulated, strict=True)]
         tables["torque"] = relative_errors(recordings, torque, left)
     together = pd.concat(tables, names=["signal"]).reorder_levels(["recording", "signal"])
     columns = joint_columns(loop.joints)

@@ -16,6 +16,10 @@ OF_SIGN = {(what,) for what in SIGN}
 _DEFAULT = 0.01, 0.0
 # Relative difference of shapes that changes a fit by less than its deviations.
 _SAME = 0.1
+# Smoothing below which a sign jumps, as a share of its scale.
+_JUMPS = 0.02
+# Form between those of arctan and tanh.
+_BETWEEN = 0.5
 
 
 def shapes_of_signs(
@@ -69,6 +73,20 @@ def has_one_sign(loop: ClosedLoop) -> bool:
             if abs(now - own) > _SAME * max(now, own, p.declaration.scale * _SAME):
                 return False
     return True
+
+
+def without_jumps(loop: ClosedLoop) -> ClosedLoop | None:
+    """The loop with a usual shape of each estimated sign that jumps; None if none does."""
+    free = {p.place: p for p in loop.free_parameters if p.place[2:] in OF_SIGN}
+    values = {}
+    for place, p in free.items():
+        if place[-1] != SIGN[0] or float(p.where(loop)) >= _JUMPS * p.declaration.scale:
+            continue
+        values[p.name] = p.declaration.scale
+        form = free.get((*place[:2], SIGN[1]))
+        if form is not None:
+            values[form.name] = _BETWEEN
+    return loop.with_values(**values) if values else None
 
 
 def reshaped(loop: ClosedLoop, effect: AbstractEffect) -> bool:

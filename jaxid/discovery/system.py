@@ -3,12 +3,14 @@
 import dataclasses
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..errors import FitError
 from ..estimate import Fit
 from ..estimate.converge import from_best_starts
+from ..estimate.minimise import measured_with_slopes
 from ..estimate.oem import oem_of
 from ..estimate.pieces import compared_signals, estimated_starts, pieces_of
 from ..simulation.batch import Batch, prepare
@@ -81,10 +83,13 @@ def _residual_and_base(
     batch: Batch, linear: Linearised, loop: ClosedLoop, output: str, free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     seen = sampled(batch, np.asarray(linear.seen[:, :, {"tau": 0, "q": 1}[output]]))
-    residual = (np.asarray(getattr(batch, output)) - seen) * np.asarray(batch.mask)[..., None]
-    residual = np.asarray(batch.compared(residual))
+    mask = np.asarray(batch.mask)[..., None]
+    scale = jnp.asarray(np.broadcast_to(mask, seen.shape).astype(float))
+    measured, by_delay = map(np.asarray, measured_with_slopes(loop, batch, scale, (output,)))
+    residual = measured - np.asarray(batch.compared(seen * mask))
     p = loop.theta.shape[0]
     base = at_samples(batch, np.asarray(base_columns(linear, p, bool(free.any()))))
+    base[..., :p] -= by_delay
     if not free.any():
         return residual, base
     shared, own = base[..., :p], base[..., p:]

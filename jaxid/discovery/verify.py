@@ -12,11 +12,12 @@ from ..estimate import OEM, Fit, SeparablePEM, Status, fit
 from ..noise import ARFilter
 from ..parameters import Bounds, read_values, write_values
 from ..recording import Recordings
+from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from .diagnosis import over_recordings
 from .hypotheses import free_of
 from .likelihood import noise_filters, score_of
-from .signs import has_one_sign, of_one_sign, reshaped
+from .signs import has_one_sign, of_one_sign, reshaped, without_jumps
 
 # Factor on the gap at the start of another refit. In a wide gap the link moves freely for longer,
 # so that all parameters of the contact influence the motion.
@@ -58,7 +59,18 @@ class Refits(eqx.Module):
         Frictions of one joint have one sign. A fit estimates the shape of that of Coulomb friction,
         so it is repeated until the others have the same. They move half of the way each time,
         because a smoother sign of one friction makes that of another one sharper.
+
+        The error has another minimum where a sign jumps, because samples then do not determine its
+        form. Along an imposed motion a fit that ends there is repeated from a usual shape.
         """
+        found = self._with_one_sign(loop, noise)
+        usual = without_jumps(found.loop)
+        if not found.status.simulated or usual is None or not imposed(found.loop):
+            return found
+        again = self._with_one_sign(usual, noise)
+        return self.best([found, again]) if again.status.simulated else found
+
+    def _with_one_sign(self, loop: ClosedLoop, noise: Sequence[ARFilter]) -> Fit:
         found = self._filtered(loop, noise)
         for _ in range(_SIGN_TURNS):
             if not found.status.simulated or has_one_sign(found.loop):

@@ -14,7 +14,7 @@ from ..control import OpenLoop
 from ..noise import ARFilter, Noise, VectorAR
 from ..parameters import Bounds
 from ..recording import Recording, Recordings
-from ..simulation.batch import Batch, motion_cutoff, prepare
+from ..simulation.batch import Batch, prepare
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate_batch
 from ..simulation.sharing import taken
@@ -94,7 +94,7 @@ def converge(
     worth = 1e-4 if alone or weights is not None else 1e-2
     weights = jnp.asarray(first if weights is None else weights)
 
-    def posed(weights: Float[Array, " outputs"], batch: Batch) -> Problem:
+    def posed(weights: Float[Array, " outputs"]) -> Problem:
         theta = loop.theta
         within = jnp.where(held, theta, bounds.lower), jnp.where(held, theta, bounds.upper)
         noise = jax.device_put(_taps(filters, weights))
@@ -103,7 +103,7 @@ def converge(
         return Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix)
 
     total, minimum, ratio, again = 0, None, jnp.ones_like(first), False
-    problem = posed(weights, batch)
+    problem = posed(weights)
     for _ in range(20):
         left = method.max_steps - total
         known = None if minimum is None or again else reweighted(problem, minimum.point, ratio)
@@ -121,15 +121,11 @@ def converge(
             minimum = dataclasses.replace(minimum, status=Status.converged)
         settled = bool(np.all(np.abs(np.asarray(new) / np.asarray(weights) - 1) < 0.1))
         ended = total >= method.max_steps or minimum.status is Status.max_seconds
-        shifted = _shifted(loop, batch, pieces)
-        again, held = bool(held.any()) or shifted, np.zeros_like(held)
+        again, held = bool(held.any()), np.zeros_like(held)
         if ended or (settled and worth < 1e-2 and not again):
             break
-        if shifted:
-            batch = prepare(loop, pieces)
-            start = jax.device_put(np.concatenate([batch.q0, batch.v0], axis=1))
         ratio, weights, worth = new / weights, new, 1e-4 if settled else worth
-        problem = posed(weights, batch)
+        problem = posed(weights)
         if alone and not again:
             there = reweighted(problem, minimum.point, ratio)
             minimum = dataclasses.replace(minimum, point=there)
@@ -147,24 +143,11 @@ def converge(
     )
 
 
-# Largest change of a delay for which the cubics of a reference are evaluated outside of their
-# intervals, as a share of a radian at the cutoff: acceleration then is right to a thousandth.
-_SHIFTED = 0.04
-
-
 def _delays(loop: ClosedLoop) -> Bool[np.ndarray, " parameters"]:
     """Which free parameters are a delay of the torque."""
     free = loop.free_parameters
     delays = [p.place == ("controller", "delay") for p in free for _ in range(p.size)]
     return np.array(delays, bool) & loop.controller.imposes
-
-
-def _shifted(loop: ClosedLoop, batch: Batch, recordings: Sequence[Recording]) -> bool:
-    """Whether the delay of the torque has changed so much that the reference is shifted again."""
-    if batch.intervals.late is None:
-        return False
-    change = np.abs(float(loop.controller.late) - np.asarray(batch.intervals.late)).max()
-    return bool(2 * np.pi * motion_cutoff(loop.controller, recordings) * change > _SHIFTED)
 
 
 def _resolved(loop: ClosedLoop, recordings: Recordings) -> Bounds:

@@ -50,7 +50,7 @@ def _explaining(recordings: Recordings, runs: tuple[Simulated, ...]) -> list[Sim
 
 def _explained(loop: ClosedLoop, recordings: Recordings, runs: tuple[Simulated, ...]) -> bool:
     """Whether the residual of every joint is smaller than its measured torque."""
-    measured = compared(loop, recordings, [r.tau for r in recordings])
+    measured = compared(loop, recordings, [r.tau for r in recordings], loop.controller.late)
     simulated = compared(loop, recordings, [np.asarray(run.tau) for run in runs])
     pairs = list(zip(measured, simulated, strict=True))
     left = sum(np.sum((m - s) ** 2, axis=0) for m, s in pairs)

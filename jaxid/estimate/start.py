@@ -88,8 +88,9 @@ def _simulated_error(
     except ModelError:
         return np.inf
     there = np.asarray(batch.mask)[..., None]
-    measured, left = (np.where(there, x, 0.0) for x in (batch.tau, batch.tau - tau))
-    measured, left = batch.compared(measured), batch.compared(left)
+    measured, simulated = (np.where(there, x, 0.0) for x in (batch.tau, tau))
+    measured = batch.compared(measured, loop.controller.late)
+    left = measured - batch.compared(simulated)
     error, size = (np.sum(np.asarray(x) ** 2, axis=(0, 1)) for x in (left, measured))
     total = float(np.mean(error / size))
     return total if np.isfinite(total) else np.inf

@@ -156,10 +156,12 @@ class Band(eqx.Module):
     with closer samples the likelihood would depend on rounding errors.
 
     - `gain`: gain of the filter at the frequencies of a real Fourier transform.
+    - `rate`: sample rate of each recording, Hz.
     - `rows`: the samples that are compared, far enough from the ends; `keep` marks those present.
     """
 
     gain: Float[Array, "recordings frequencies"]
+    rate: Float[Array, " recordings"]
     rows: Int[Array, "recordings rows"]
     keep: Bool[Array, "recordings rows"]
 
@@ -198,15 +200,26 @@ class Band(eqx.Module):
         most = shared_length(max(len(row) for row in rows))
         keep = np.arange(most) < np.array([[len(row)] for row in rows])
         filled = np.stack([np.pad(row, (0, most - len(row)), "edge") for row in rows])
-        return cls(jnp.asarray(np.stack(gains)), jnp.asarray(filled), jnp.asarray(keep))
+        rates = np.array([r.rate for r in recordings])
+        return cls(*map(jnp.asarray, (np.stack(gains), rates, filled, keep)))
 
     def __call__(
-        self, x: Float[Array, "recordings samples *axes"]
+        self,
+        x: Float[Array, "recordings samples *axes"],
+        late: Float[Array, ""] | None = None,
     ) -> Float[Array, "recordings rows *axes"]:
-        """Filtered signals, with zeros for missing samples and rows."""
+        """Filtered signals, with zeros for missing samples and rows.
+
+        **Arguments:**
+
+        - `late`: time by which the signals are delayed, s; at most a few periods of the cutoff.
+        """
         axes = (1,) * (x.ndim - 2)
         size = 2 * (self.gain.shape[1] - 1)
         gain = self.gain.astype(x.dtype)
+        if late is not None:
+            frequency = jnp.arange(self.gain.shape[1]) * self.rate[:, None] / size
+            gain = gain * jnp.exp(-2j * jnp.pi * frequency * late)
         wave = jnp.fft.rfft(x, size, axis=1) * gain.reshape(*gain.shape, *axes)
         passed = self.picked(jnp.fft.irfft(wave, size, axis=1))
         return passed * self.keep.reshape(*self.keep.shape, *axes)

@@ -26,8 +26,6 @@ class Interval(eqx.Module):
     the signals that are constant in the interval, by name, `(joints,)` each. `noise` and `rate` are
     added to the position and velocity that the sensors read, `push` and `pull` to the torque on
     drives and links. Each of the four is given at both ends and is linear in between, or is None.
-    `late` is the part of the delay of the torque by which the reference is shifted already, s; None
-    if the law has no delay.
     """
 
     t0: Float[Array, ""]
@@ -41,7 +39,6 @@ class Interval(eqx.Module):
     rate: Float[Array, "2 joints"] | None = None
     push: Float[Array, "2 joints"] | None = None
     pull: Float[Array, "2 joints"] | None = None
-    late: Float[Array, ""] | None = None
 
 
 class Batch(eqx.Module):
@@ -70,13 +67,17 @@ class Batch(eqx.Module):
         return self.mask if self.band is None else self.band.keep
 
     def compared(
-        self, x: Float[Any, "recordings samples *axes"]
+        self, x: Float[Any, "recordings samples *axes"], late: Float[Array, ""] | None = None
     ) -> Float[Any, "recordings rows *axes"]:
         """The part of signals at the samples that is compared.
 
         Missing samples, and rows in which a joint stands still, are zero.
+
+        **Arguments:**
+
+        - `late`: the controller's delay for measured signals; None for simulated ones.
         """
-        return compared_part(self.band, self.moving, jnp.asarray(x))
+        return compared_part(self.band, self.moving, jnp.asarray(x), late)
 
     def uncompared(self) -> "Batch":
         """The batch for a simulation: what is compared would only make programs differ."""
@@ -162,9 +163,6 @@ def _drive(
         {name: padded(x) for name, x in held_at(recording, grid, held).items()},
         ends,
         rate,
-        None,
-        None,
-        None if signals.late is None else np.full(length, signals.late),
     )
 
 
@@ -366,12 +364,14 @@ def compared(
     loop: ClosedLoop,
     recordings: Recordings | Sequence[Recording],
     signals: Sequence[Float[np.ndarray, "_samples joints"]],
+    late: Float[Array, ""] | None = None,
 ) -> list[Float[np.ndarray, "_samples joints"]]:
     """The part of signals that is compared under the controller, for each recording.
 
     **Arguments:**
 
     - `signals`: one for each recording, `(samples, joints)`.
+    - `late`: the controller's delay for measured signals; None for simulated ones.
     """
     band = band_of(loop, recordings)
     moving = moving_of(loop, recordings, band)
@@ -379,7 +379,7 @@ def compared(
     if band is not None:
         longest = max(len(x) for x in found)
         padded = np.stack([np.pad(x, ((0, longest - len(x)), (0, 0))) for x in found])
-        passed, keep = np.asarray(compared_part(band, None, padded)), np.asarray(band.keep)
+        passed, keep = np.asarray(compared_part(band, None, padded, late)), np.asarray(band.keep)
         found = [x[kept] for x, kept in zip(passed, keep, strict=True)]
     if moving is not None:
         found = [x * there[: len(x)] for x, there in zip(found, np.asarray(moving), strict=True)]

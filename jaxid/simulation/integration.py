@@ -49,15 +49,7 @@ def _line(ends: Float[Array, "2 joints"] | None, dt, h, joints: int) -> Float[Ar
     return ends[0] + dt * (ends[1] - ends[0]) / jnp.where(h > 0, h, 1.0)
 
 
-def _reference(loop: ClosedLoop, interval: Interval, since: Float[Array, ""]) -> Reference:
-    """The reference at a time after the start of an interval, s.
-
-    A fit changes the delay of the torque, so the cubic is evaluated at a time that is shifted by
-    the change.
-    """
-    dt = since
-    if interval.late is not None:
-        dt = since + (loop.controller.late - interval.late)
+def _reference(interval: Interval, dt: Float[Array, ""]) -> Reference:
     c0, c1, c2, c3 = interval.reference
     q = c0 + dt * (c1 + dt * (c2 + dt * c3))
     v = c1 + dt * (2 * c2 + 3 * dt * c3)
@@ -81,9 +73,7 @@ def outside_at(loop: ClosedLoop, interval: Interval, t: Float[Array, ""]) -> Out
 def instant_at(loop: ClosedLoop, interval: Interval, t: Float[Array, ""], state: State) -> Instant:
     """The loop at a time within an interval, s."""
     outside = outside_at(loop, interval, t)
-    return instant(
-        loop, t, state, _reference(loop, interval, t - interval.t0), outside, interval.label
-    )
+    return instant(loop, t, state, _reference(interval, t - interval.t0), outside, interval.label)
 
 
 def initial(
@@ -94,7 +84,7 @@ def initial(
 ) -> Float[Array, " states"]:
     """The flat state at the start of a run, `(states,)`, at measured position and velocity."""
     first = jax.tree.map(lambda leaf: leaf[0], intervals)
-    reference = _reference(loop, first, jnp.zeros(()))
+    reference = _reference(first, jnp.zeros(()))
     start = rest(loop, *behind(loop, q, v))
     return ravel_pytree(settle(loop, first.t0, start, reference, first.label))[0]
 
@@ -108,7 +98,7 @@ def observe(
     def begin(interval: Interval, x: Float[Array, " states"]):
         state = unravel(x)
         if loop.controller.period is not None:
-            asked = _reference(loop, interval, jnp.zeros(()))
+            asked = _reference(interval, jnp.zeros(()))
             sensed = reading(loop, state, outside_at(loop, interval, interval.t0))
             ticked = loop.controller.tick(sensed, asked, state.controller)
             held = jnp.where(interval.tick, ticked, state.controller)
@@ -256,7 +246,7 @@ def states_of_reference(
     """The states at grid points where the reference is the motion."""
 
     def at(interval: Interval) -> Float[Array, " states"]:
-        now = _reference(loop, interval, jnp.zeros(()))
+        now = _reference(interval, jnp.zeros(()))
         q, v = behind(loop, now.q, now.v)
         return ravel_pytree(dataclasses.replace(unflatten(loop)(x0), q=q, v=v))[0]
 

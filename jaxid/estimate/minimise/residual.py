@@ -120,13 +120,37 @@ def sensitivity_from(
         return seen, slopes, found.end, found.end_slopes, found.result
 
     seen, slopes, *end, result = each(one, batch.intervals, batch.at, x, tangents)
-    measured = jnp.concatenate([getattr(batch, s) for s in signals], axis=-1)
     scale = weights * batch.mask[..., None]
-    residual = (measured - seen) * scale
-    slopes = -slopes * scale[..., None]
-    residual, slopes = batch.compared(residual), batch.compared(slopes)
+    measured, by_delay = measured_with_slopes(loop, batch, scale, signals)
+    residual = measured - batch.compared(seen * scale)
+    slopes = -batch.compared(slopes * scale[..., None])
     by_start = slopes[..., p:] if slopes.shape[-1] > p else None
-    return Sensitivity(residual, residual, slopes[..., :p], by_start, result), *end
+    return Sensitivity(residual, residual, slopes[..., :p] + by_delay, by_start, result), *end
+
+
+def measured_with_slopes(
+    loop: ClosedLoop,
+    batch: Batch,
+    scale: Float[Array, "recordings samples outputs"],
+    signals: tuple[str, ...],
+) -> tuple[
+    Float[Array, "recordings rows outputs"], Float[Array, "#recordings #rows #outputs parameters"]
+]:
+    """Measured signals as they are compared, and their derivatives by the loop's parameters.
+
+    Of all parameters only the delay of the torque changes them.
+
+    **Arguments:**
+
+    - `scale`: factor of each sample; zero at padding. `signals`: as for `sensitivity`.
+    """
+    x = jnp.concatenate([getattr(batch, s) for s in signals], axis=-1) * scale
+    if batch.band is None:
+        return batch.compared(x), jnp.zeros((1, 1, 1, loop.theta.shape[0]))
+    late, one = loop.controller.late, jnp.ones(())
+    measured, by_delay = jax.jvp(lambda late: batch.compared(x, late), (late,), (one,))
+    change = jax.jacfwd(lambda theta: loop.with_theta(theta).controller.late)(loop.theta)
+    return measured, by_delay[..., None] * change
 
 
 def raw_residual(
@@ -144,8 +168,9 @@ def raw_residual(
         return seen.reshape(seen.shape[0], -1)
 
     seen = each(one, batch.intervals, batch.at, batch.q0, batch.v0)
+    scale = weights * batch.mask[..., None]
     measured = jnp.concatenate([getattr(batch, s) for s in signals], axis=-1)
-    return batch.compared((measured - seen) * weights * batch.mask[..., None])
+    return batch.compared(measured * scale, loop.controller.late) - batch.compared(seen * scale)
 
 
 def through_filter(
