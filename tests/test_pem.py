@@ -11,6 +11,7 @@ import pytest
 
 import jaxid
 from jaxid.errors import FitError, NoiseError
+from jaxid.estimate.covariance import newey_west
 from jaxid.estimate.minimise import linearise, minimise, point_around
 from jaxid.estimate.refit import Lanes, refit
 from jaxid.noise import ARFilter, fit_var
@@ -259,3 +260,34 @@ def test_regressions_have_no_bootstrap(recording):
     fit = jaxid.fit(jaxid.scara(), recording, jaxid.IDIM())
     with pytest.raises(FitError, match="fit by OEM, SeparablePEM or JointPEM"):
         jaxid.bootstrap(fit)
+
+
+def test_newey_west_is_true_where_the_error_grows_with_the_derivative():
+    """Least squares in closed form; the error has a memory of a few rows, and bursts."""
+    rng = np.random.default_rng(5)
+    t = np.linspace(0, 60, 900)
+    regressors = np.stack([np.sin(1.3 * t), np.sin(t) ** 3, np.ones_like(t)], axis=1)
+    size = 0.05 + np.abs(regressors[:, 1])
+    inverse = np.linalg.pinv(regressors)
+    information = regressors.T @ regressors
+    errors, said, plain = [], [], []
+    for _ in range(400):
+        white = rng.standard_normal(len(t) + 1)
+        noise = size * (white[1:] + 0.5 * white[:-1])
+        theta = inverse @ noise
+        left = noise - regressors @ theta
+        meat = newey_west([left[:, None]], [regressors[:, None]])
+        bread = np.linalg.inv(information)
+        errors.append(theta)
+        said.append(np.sqrt(np.diag(bread @ meat @ bread)))
+        plain.append(np.sqrt(np.diag(bread) * left.var()))
+    inside = np.mean(np.abs(errors) < 1.96 * np.array(said), axis=0)
+    assert np.all((inside > 0.9) & (inside < 0.98))
+    assert np.mean(np.abs(errors) < 1.96 * np.array(plain), axis=0).min() < 0.85
+
+
+def test_deviations_along_a_recorded_motion_allow_for_its_error(recording):
+    loop = jaxid.scara(jaxid.control.Tracking(cutoff=20.0))
+    assert (
+        "Newey" in jaxid.fit(loop, recording, jaxid.SeparablePEM(GIVEN, orders=(1, 1))).deviations
+    )

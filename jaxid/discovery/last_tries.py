@@ -15,6 +15,7 @@ from .landscape import form
 from .models import LIKELY, Model, listed
 from .offsets import instead_of_offsets
 from .relevance import loses
+from .shapes import has_held_shape, shapes_of
 from .signs import reshaped
 from .transmissions import similar_ones, suspected
 from .watched import ROUND
@@ -30,27 +31,49 @@ def replaced(search: Examined, at: Model) -> Model | None:
     """The best fit of a model with another effect in the place of one, if it is better.
 
     Predictions are inexact, so a predicted model that is not decisively worse may be better. If a
-    shape of the joint's sign is estimated, they are less exact.
+    shape of the joint's sign is estimated, they are less exact. An effect whose shape is held may
+    be better with another shape. Along an imposed motion, where a fit takes seconds, it is fitted
+    with the shape free.
     """
     assert at.fit is not None
     loop, own, best = at.fit.loop, Counter(map(form, at.effects)), at
+    along = imposed(loop)
     start = search.visited.fitted(())
     assert start is not None
     reach = max(DECISIVE, _INEXACT * (start.score - at.score))
 
     def is_rival(m: Model) -> bool:
         others = [e for e in m.effects if form(e) not in own]
-        if m.fit is not None or m.curve is not None or len(m.effects) != len(at.effects):
+        shaped = along and any(map(has_held_shape, others))
+        known = m.fit is not None and not (shaped and shapes_of(m.fit.loop, len(m.effects)))
+        if known or m.curve is not None or len(m.effects) != len(at.effects):
             return False
         one = (Counter(map(form, m.effects)) - own).total() == 1
-        allowed = reach if any(reshaped(loop, e) for e in others) else DECISIVE
-        return one and bool(m.score < at.score + allowed)
+        inexact = shaped or any(reshaped(loop, e) for e in others)
+        return one and bool(m.score < at.score + (reach if inexact else DECISIVE))
 
     rivals = search.visited.ranked(is_rival)
     for rival in rivals[:_RIVALS]:
-        again = partial(search.fits.exchanged, loop, at.effects, rival.effects, rival.noise)
-        best = _better(search, best, rival.effects, again)
+        if rival.fit is None:
+            again = partial(search.fits.exchanged, loop, at.effects, rival.effects, rival.noise)
+            best = _better(search, best, rival.effects, again)
+        best = _with_free_shapes(search, best, rival.effects) if along else best
     return None if best is at else best
+
+
+def _with_free_shapes(search: Examined, best: Model, effects: Sequence[AbstractEffect]) -> Model:
+    """The better one of a model and of a fitted rival with the held shapes of its effects free."""
+    rival = search.visited.fitted(effects)
+    if rival is None or rival is best:
+        return best
+    assert rival.fit is not None
+    loop = rival.fit.loop
+    held = shapes_of(loop, len(rival.effects))
+    if not held:
+        return best
+    start = loop.free(*[p.name for p in held])
+    again = partial(search.fits.with_shapes, rival.effects, start, rival.noise)
+    return _better(search, best, rival.effects, again)
 
 
 def with_transmission(search: Examined, at: Model) -> Model | None:

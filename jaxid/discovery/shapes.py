@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..effects import AbstractEffect
 from ..estimate import Fit, Status
-from ..parameters import Parameter
+from ..parameters import Parameter, list_parameters
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..simulation.widening import LEAD, SIGN
@@ -20,6 +21,8 @@ from .release import doubtful
 _SHARES, _FORMS = (1.0, 0.5), (0.0, 1.0)
 # Largest distance in deviations between two fits in the same minimum.
 _SAME = 0.5
+# Shapes that any fit may estimate.
+_OF_FRICTION = (*SIGN, LEAD)
 # Smallest weight of a minimum that is mentioned.
 _SHOWN = 0.05
 
@@ -39,7 +42,7 @@ def with_shapes(fits: Fits, at: Model) -> Fit:
     """
     assert at.fit is not None
     loop = at.fit.loop
-    held = _held_shapes(loop, len(at.effects))
+    held = shapes_of(loop, len(at.effects))
     if not held or not imposed(loop):
         return at.fit
     found = [fits.with_shapes(at.effects, start, at.noise) for start in _starts(loop, held)]
@@ -47,16 +50,24 @@ def with_shapes(fits: Fits, at: Model) -> Fit:
     return _merged(sound) if sound else at.fit
 
 
-def _held_shapes(loop: ClosedLoop, added: int) -> list[Parameter]:
-    """Shapes of the last effects of a loop that are held by declaration."""
+def shapes_of(loop: ClosedLoop, added: int) -> list[Parameter]:
+    """Shapes of the last effects of a loop that are held by declaration, except those of signs."""
     first = len(loop.effects) - added
     return [
         p
         for p in doubtful(loop)
         if int(p.place[1]) >= first
-        and p.place[-1] not in (*SIGN, LEAD)
+        and p.place[-1] not in _OF_FRICTION
         and np.isfinite(p.where(loop))
     ]
+
+
+def has_held_shape(effect: AbstractEffect) -> bool:
+    """Whether a shape of an effect is held by declaration, except those of signs."""
+    return any(
+        not (p.declaration.free or p.declaration.linear) and p.place[-1] not in _OF_FRICTION
+        for p in list_parameters(effect)
+    )
 
 
 def _starts(loop: ClosedLoop, held: Sequence[Parameter]) -> list[ClosedLoop]:

@@ -1,4 +1,4 @@
-"""Covariance of a least-squares estimate: equation (A.1), sandwich, and the paper's formula."""
+"""Covariance of a least-squares estimate: (A.1), two sandwich estimates, the paper's formula."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -19,10 +19,12 @@ from .result import Fit, determined_covariance
 if TYPE_CHECKING:
     import pandas as pd
 
-Deviations = Literal["sandwich", "white", "paper"]
+Deviations = Literal["sandwich", "newey_west", "white", "paper"]
 
 SAID = {
     "sandwich": "sandwich estimate, which allows for coloured residuals",
+    "newey_west": "sandwich estimate of Newey and West, which allows for errors whose size depends "
+    "on the motion",
     "white": "equation (A.1) with the gradient of the filtered error, valid if that error is white",
     "paper": "equation (A.1) with the filtered error's variance but the unfiltered gradient, as "
     "printed by Brunot et al. 2016: not reliable",
@@ -121,6 +123,8 @@ def covariance_of(
     jacobians, meat = reduced.jacobians, None
     if kind == "sandwich":
         meat = score_covariance(reduced.residuals, jacobians)
+    elif kind == "newey_west":
+        meat = newey_west(reduced.residuals, jacobians)
     else:
         whiten = np.linalg.inv(np.linalg.cholesky(reduced.spread(problem.mix is not None)))
         jacobians = [np.einsum("ij,kjp->kip", whiten, j) for j in jacobians]
@@ -183,6 +187,30 @@ def score_covariance(
     return meat
 
 
+def newey_west(
+    residuals: Sequence[Float[np.ndarray, "_samples outputs"]],
+    jacobians: Sequence[Float[np.ndarray, "_samples outputs parameters"]],
+) -> Float[np.ndarray, "parameters parameters"]:
+    """Covariance of J'r from the products J'r of the rows (Newey and West 1987).
+
+    Along a recorded motion the error is largest where the motion is least known, as at reversals
+    and in bursts, where derivatives are large too. Correlations are assumed to decay within some
+    rows, as those of a filtered error do.
+    """
+    p = jacobians[0].shape[-1]
+    meat, rows = np.zeros((p, p)), sum(map(len, residuals))
+    for r, j in zip(residuals, jacobians, strict=True):
+        scores = np.einsum("ko,kop->kp", r, j)
+        # The usual number of lags for Bartlett's weights.
+        lags = min(int(np.ceil(4 * (len(scores) / 100) ** (2 / 9))), len(scores) - 1)
+        meat += scores.T @ scores
+        for lag in range(1, lags + 1):
+            product = scores[lag:].T @ scores[:-lag]
+            meat += (1 - lag / (lags + 1)) * (product + product.T)
+    # The fit lowers the residual; an estimate of its variance allows for it in the same way.
+    return meat * rows / max(rows - p, 1)
+
+
 def optimum_of(fit: Fit, what: str) -> Optimum:
     """The optimum of a fit.
 
@@ -203,8 +231,9 @@ def deviations(fit: Fit) -> "pd.DataFrame":
 
     - `fit`: by `OEM`, `SeparablePEM` or `JointPEM`.
 
-    **Returns:** a row for each parameter, a column for each of `"sandwich"`, `"white"` (A.1) and
-    `"paper"` (A.1 with the gradient of the unfiltered error, as in the paper's numbers).
+    **Returns:** a row for each parameter, a column for each of `"sandwich"`, `"newey_west"`,
+    `"white"` (A.1) and `"paper"` (A.1 with the gradient of the unfiltered error, as in the paper's
+    numbers).
 
     **Raises:** `FitError` for a fit by regression.
     """

@@ -44,8 +44,8 @@ class OEM(AbstractMethod):
       estimates those of recordings that do not start at rest.
     - `window`: length in s of pieces that are simulated separately, each from its own estimated
       state (multiple shooting); None for whole recordings.
-    - `deviations`: `"sandwich"` for coloured residuals, `"white"` for (A.1), `"paper"` for (A.1) as
-      printed in the paper.
+    - `deviations`: `"sandwich"` for coloured residuals, `"newey_west"` for errors whose size
+      depends on the motion, `"white"` for (A.1), `"paper"` for (A.1) as printed in the paper.
     - `tolerance`: it stops when a step is shorter than this many standard deviations.
     - `max_steps`: largest number of iterations, those for better weights included.
     - `max_seconds`: time limit, checked between iterations; the values so far are returned.

@@ -59,8 +59,9 @@ class SeparablePEM(AbstractMethod):
       all.
     - `first_step`: `"filtered"` for parameters from the filtered error; `"plain"` for the paper's
       variant, in which the parameters are those of output error.
-    - `deviations`: `"white"` for (A.1), `"sandwich"`, `"paper"`; by default `"white"` if parameters
-      come from the filtered error and all recordings are equally noisy, else `"sandwich"`.
+    - `deviations`: `"white"` for (A.1), `"sandwich"`, `"newey_west"`, `"paper"`. By default
+      `"newey_west"` if the law is unknown; else `"white"` if parameters come from the filtered
+      error and all recordings are equally noisy, or `"sandwich"`.
     - `tolerance`: relative change of the prediction error's variance at which it stops.
     - `rounds`: largest number of alternations.
 
@@ -99,7 +100,12 @@ class SeparablePEM(AbstractMethod):
         return report(kind, done, recordings, seconds, self, noise, rounds)
 
     def _deviations(self, done: Converged, noise: Noise) -> Deviations:
-        """(A.1), which assumes one noise level; the sandwich if levels differ significantly."""
+        """(A.1), which assumes one noise level; the sandwich if levels differ significantly.
+
+        Along a recorded motion the error of the motion is part of the residual.
+        """
+        if done.batch.band is not None and self.first_step == "filtered":
+            return "newey_west"
         ratios = np.stack(levels([innovations(x, noise) for x in residual_series(done)]))
         uneven = np.any(ratios.max(axis=0) > 1.3 * ratios.min(axis=0))
         return "sandwich" if uneven or self.first_step == "plain" else "white"
