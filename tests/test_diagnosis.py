@@ -11,7 +11,7 @@ from stories import Bump
 
 import jaxid
 from jaxid.discovery.hypotheses import candidates, survey
-from jaxid.discovery.score import Gram, corrected, effective_tests
+from jaxid.discovery.score import Gram, _root, corrected, effective_tests
 from jaxid.effects import Curve, Motion, TorqueOffset
 
 
@@ -73,6 +73,19 @@ def test_effective_tests_are_honest():
     assert effective_tests(same, blocks) == pytest.approx(1.0, rel=0.15)
     assert effective_tests(apart, blocks) == pytest.approx(40.0, rel=0.15)
     assert corrected(0.01, 10) == pytest.approx(1 - 0.99**10)
+
+
+def test_noise_of_parallel_columns_has_their_covariance():
+    columns = np.random.default_rng(2).standard_normal((60, 25)).astype(np.float32)
+    columns /= np.linalg.norm(columns, axis=1)[:, None]
+    columns[7], columns[9] = columns[3], 1e-2 * columns[3]
+    gram = (columns @ columns.T).astype(float)
+    root = _root(gram)
+    assert root.shape[1] <= 26
+    np.testing.assert_allclose(root @ root.T, gram, atol=1e-5)
+    gram[4, 4] = np.nan
+    with pytest.raises(np.linalg.LinAlgError):
+        _root(gram)
 
 
 def test_a_joint_that_is_held_still_has_shapes_to_screen():

@@ -5,14 +5,18 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stories import silent
 from test_release import DRY, axis, recorded
 
 import jaxid
+from jaxid.discovery.asked import Asked
 from jaxid.discovery.fits import Fits
+from jaxid.discovery.last_tries import replaced
 from jaxid.discovery.models import Model
-from jaxid.discovery.shapes import _held_shapes, _merged, _starts, with_shapes
+from jaxid.discovery.search import Search
+from jaxid.discovery.shapes import _merged, _starts, has_held_shape, shapes_of, with_shapes
 from jaxid.discovery.verify import Refits
-from jaxid.effects import Coulomb, Stribeck
+from jaxid.effects import Coulomb, QuadraticDrag, Stribeck
 from jaxid.noise import ARFilter
 from jaxid.storage.campaign import Campaign
 
@@ -58,7 +62,7 @@ def test_effects_without_a_held_shape_keep_their_fit(ended):
 
 def test_each_shape_has_its_own_starts(ended):
     _, model = ended
-    (exponent,) = _held_shapes(model.fit.loop, 1)
+    (exponent,) = shapes_of(model.fit.loop, 1)
     starts = _starts(model.fit.loop, [exponent])
     assert [float(exponent.where(x)) for x in starts] == [2.0, 1.0]
     # The form of the joint's sign is varied where it is estimated.
@@ -88,3 +92,30 @@ def test_deviations_contain_the_distance_between_minima(ended):
     np.testing.assert_allclose(found.covariance, one.covariance, rtol=1e-12)
     np.testing.assert_array_equal(found.theta, one.theta)
     assert found.notes == one.notes
+
+
+def test_a_rival_whose_shape_is_held_is_fitted_with_the_shape_free(ended):
+    """Drag in the place of the peak, which with its exponent held has a score that is worse by 20.
+
+    The score of the drag is made up; the fits are not.
+    """
+    refits, peak = ended
+    asked = Asked(refits.recordings, None, jaxid.OEM(), jaxid.catalogue, 0.01, 0.05, 6)
+    search = Search(asked, Campaign(None, {}), silent)
+    bare = dataclasses.replace(
+        peak.fit.loop.with_effects(peak.fit.loop.effects[:-1]), held=peak.fit.loop.held
+    )
+    search.visit((), refits.filtered(bare, peak.noise))
+    held = search.visit(search.added(peak.fit), peak.fit)
+    assert has_held_shape(held.effects[0])
+    dragged = refits.filtered(bare.add(QuadraticDrag(1)), peak.noise)
+    drag = search.judged(search.added(dragged), dragged)
+    drag = dataclasses.replace(drag, score=held.score - 20.0)
+    search.visited.add(drag)
+    found = replaced(search, drag)
+    assert found is not None
+    assert found.names == (("stribeck", 1),)
+    assert "ds1" in found.fit.loop.names
+    assert found.score < drag.score - 20
+    # Its shape is estimated now, so it is not tried again.
+    assert replaced(search, dataclasses.replace(drag, score=found.score - 1.0)) is None

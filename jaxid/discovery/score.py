@@ -334,8 +334,8 @@ def effective_tests(gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0
     """
     import scipy
 
-    n = len(gram.gram)
-    noise = _root(gram.gram) @ np.random.default_rng(seed).standard_normal((n, draws))
+    root = _root(gram.gram)
+    noise = root @ np.random.default_rng(seed).standard_normal((root.shape[1], draws))
     smallest = np.ones(draws)
     for _, columns in by_width(blocks):
         inner = gram.gram[columns[:, :, None], columns[:, None, :]]
@@ -349,14 +349,20 @@ def effective_tests(gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0
     return max(1.0, float(np.log(0.9) / np.log1p(-lowest)))
 
 
-def _root(gram: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """A matrix whose product with its transpose is a Gram matrix, up to rounding."""
-    try:
-        return np.linalg.cholesky(gram + 1e-5 * np.eye(len(gram)))
-    except np.linalg.LinAlgError:
-        # Single-precision columns that are almost parallel.
-        values, vectors = np.linalg.eigh(gram)
-        return vectors * np.sqrt(np.maximum(values, 0.0))
+def _root(gram: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n rank"]:
+    """A matrix whose product with its transpose is a Gram matrix, up to a tenth of `WEAK`.
+
+    Columns in single precision may be parallel up to rounding. A Cholesky decomposition with pivots
+    leaves out what the others explain.
+    """
+    import scipy
+
+    if not np.isfinite(gram).all():
+        raise np.linalg.LinAlgError("the Gram matrix is not finite")
+    lower, pivots, rank, _ = scipy.linalg.lapack.dpstrf(gram, tol=0.1 * WEAK, lower=1)
+    root = np.empty((len(gram), rank))
+    root[pivots - 1] = np.tril(lower)[:, :rank]
+    return root
 
 
 def corrected(p: float, tests: float) -> float:
