@@ -12,6 +12,7 @@ import pytest
 
 import jaxid
 from jaxid.control import Tracking
+from jaxid.discovery.likelihood import noise_filters
 from jaxid.discovery.predict import Predictor
 from jaxid.discovery.release import doubtful, released
 from jaxid.discovery.signs import has_one_sign, of_one_sign
@@ -248,3 +249,16 @@ def test_a_fit_that_ends_at_a_jump_is_repeated_from_a_usual_sign():
     table = found.table()
     for name, true in (("form1", 0.5), ("Fc1", DRY), ("Fv1", DRAG)):
         assert table.loc[name, "value"] == pytest.approx(true, abs=4 * table.loc[name, "std"])
+
+
+def test_noise_does_not_determine_the_delay():
+    """Noise of a third of the torque: the delay of the smallest noise is not that of the motion."""
+    runs = jaxid.Recordings.of([recorded(k, arctan, noise=2.0) for k in (1, 2)])
+    plain = jaxid.fit(axis(), runs, jaxid.OEM(progress=False))
+    for fit in (
+        plain,
+        Refits(runs, jaxid.OEM()).filtered(plain.loop, noise_filters(plain.residuals)),
+    ):
+        value, std = fit.table().loc["delay", ["value", "std"]]
+        assert abs(value) < 3 * std
+        assert 5e-4 < std < 5e-3

@@ -24,7 +24,7 @@ class Tracking(AbstractController):
     both loops track equally well (Gautier, Janot, Vandanjon 2013). The recorded motion is
     low-passed forward and backward before differentiation. The same filter is applied to measured
     and simulated torque before they are compared (the parallel filter of Gautier 1997). The delay
-    shifts the measured torque there; simulated torque is that at the time at which it acts.
+    advances the simulated torque there; a simulation gives it at the time at which it acts.
 
     **Arguments:**
 

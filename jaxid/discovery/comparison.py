@@ -79,8 +79,9 @@ class Comparison(AbstractShown):
             return record.time, record.q, np.asarray(run.q)
         band = band_of(self.loop, self.recordings)
         loop, records = self.loop, self.recordings
-        measured = compared(loop, records, [r.tau for r in records], loop.controller.late)[k]
-        simulated = compared(loop, records, [np.asarray(x.tau) for x in self.runs])[k]
+        torques = [np.asarray(x.tau) for x in self.runs]
+        measured = compared(loop, records, [r.tau for r in records])[k]
+        simulated = compared(loop, records, torques, loop.controller.late)[k]
         if band is None:
             return record.time, measured, simulated
         rows = np.asarray(band.rows)[k][np.asarray(band.keep)[k]]
@@ -298,8 +299,9 @@ def _errors(
         [np.asarray(v) - np.asarray(run.v) for v, run in zip(velocity, runs, strict=True)],
     )
     if not isinstance(loop.controller, OpenLoop):
-        torque = compared(loop, recordings, [r.tau for r in recordings], loop.controller.late)
-        simulated = compared(loop, recordings, [np.asarray(run.tau) for run in runs])
+        torques = [np.asarray(run.tau) for run in runs]
+        torque = compared(loop, recordings, [r.tau for r in recordings])
+        simulated = compared(loop, recordings, torques, loop.controller.late)
         left = [x - y for x, y in zip(torque, simulated, strict=True)]
         tables["torque"] = relative_errors(recordings, torque, left)
     together = pd.concat(tables, names=["signal"]).reorder_levels(["recording", "signal"])

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from ..errors import FitError
 from ..estimate import Fit
 from ..estimate.converge import from_best_starts
-from ..estimate.minimise import measured_with_slopes
+from ..estimate.minimise import simulated_with_slopes
 from ..estimate.oem import oem_of
 from ..estimate.pieces import compared_signals, estimated_starts, pieces_of
 from ..simulation.batch import Batch, prepare
@@ -25,6 +25,7 @@ from .signatures import left_for_links
 class System(eqx.Module):
     """The loop linearised along its runs, and its residual.
 
+    - `batch`: its band advances simulated signals by the delay of the torque.
     - `left`: torque that reaches the links, after the loop's own effects on the drives.
     - `residual`: measured minus simulated output at the samples, in the compared band.
     - `base`: derivatives of the output by the free parameters and by the estimated initial states.
@@ -56,7 +57,7 @@ class System(eqx.Module):
                 "analyse: fit it by OEM first"
             )
         left = left_for_links(loop, linear.motion)
-        return cls(loop, batch, linear, left, residual, base, row)
+        return cls(loop, advanced(batch, loop), linear, left, residual, base, row)
 
     @property
     def mask(self) -> Bool[np.ndarray, "recordings samples"]:
@@ -79,17 +80,24 @@ def _as_fitted(fit: Fit | Comparison, loop: ClosedLoop) -> tuple[str, Batch, np.
     return compared_signals(method, loop)[0], batch, free
 
 
+def advanced(batch: Batch, loop: ClosedLoop) -> Batch:
+    """The batch for simulated signals, which precede the measured ones by the law's delay."""
+    if batch.band is None:
+        return batch
+    return dataclasses.replace(batch, band=batch.band.advanced(loop.controller.late))
+
+
 def _residual_and_base(
     batch: Batch, linear: Linearised, loop: ClosedLoop, output: str, free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     seen = sampled(batch, np.asarray(linear.seen[:, :, {"tau": 0, "q": 1}[output]]))
     mask = np.asarray(batch.mask)[..., None]
-    scale = jnp.asarray(np.broadcast_to(mask, seen.shape).astype(float))
-    measured, by_delay = map(np.asarray, measured_with_slopes(loop, batch, scale, (output,)))
-    residual = measured - np.asarray(batch.compared(seen * mask))
+    simulated, by_delay = simulated_with_slopes(loop, batch, jnp.asarray(seen * mask))
+    residual = np.asarray(batch.compared(getattr(batch, output) * mask) - simulated)
     p = loop.theta.shape[0]
-    base = at_samples(batch, np.asarray(base_columns(linear, p, bool(free.any()))))
-    base[..., :p] -= by_delay
+    columns = np.asarray(base_columns(linear, p, bool(free.any())))
+    base = at_samples(advanced(batch, loop), columns)
+    base[..., :p] += np.asarray(by_delay)
     if not free.any():
         return residual, base
     shared, own = base[..., :p], base[..., p:]

@@ -50,8 +50,9 @@ def _explaining(recordings: Recordings, runs: tuple[Simulated, ...]) -> list[Sim
 
 def _explained(loop: ClosedLoop, recordings: Recordings, runs: tuple[Simulated, ...]) -> bool:
     """Whether the residual of every joint is smaller than its measured torque."""
-    measured = compared(loop, recordings, [r.tau for r in recordings], loop.controller.late)
-    simulated = compared(loop, recordings, [np.asarray(run.tau) for run in runs])
+    torques = [np.asarray(run.tau) for run in runs]
+    measured = compared(loop, recordings, [r.tau for r in recordings])
+    simulated = compared(loop, recordings, torques, loop.controller.late)
     pairs = list(zip(measured, simulated, strict=True))
     left = sum(np.sum((m - s) ** 2, axis=0) for m, s in pairs)
     return bool(np.all(left <= 1.05**2 * sum(np.sum(m**2, axis=0) for m, _ in pairs)))

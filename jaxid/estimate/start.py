@@ -89,8 +89,8 @@ def _simulated_error(
         return np.inf
     there = np.asarray(batch.mask)[..., None]
     measured, simulated = (np.where(there, x, 0.0) for x in (batch.tau, tau))
-    measured = batch.compared(measured, loop.controller.late)
-    left = measured - batch.compared(simulated)
+    measured = batch.compared(measured)
+    left = measured - batch.compared(simulated, loop.controller.late)
     error, size = (np.sum(np.asarray(x) ** 2, axis=(0, 1)) for x in (left, measured))
     total = float(np.mean(error / size))
     return total if np.isfinite(total) else np.inf

@@ -6,7 +6,7 @@ import itertools
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Bool, Float, Inexact, Int, Shaped
 
 from ..errors import RecordingError
 from ..recording import Recording
@@ -160,7 +160,7 @@ class Band(eqx.Module):
     - `rows`: the samples that are compared, far enough from the ends; `keep` marks those present.
     """
 
-    gain: Float[Array, "recordings frequencies"]
+    gain: Inexact[Array, "recordings frequencies"]
     rate: Float[Array, " recordings"]
     rows: Int[Array, "recordings rows"]
     keep: Bool[Array, "recordings rows"]
@@ -206,23 +206,27 @@ class Band(eqx.Module):
     def __call__(
         self,
         x: Float[Array, "recordings samples *axes"],
-        late: Float[Array, ""] | None = None,
+        ahead: Float[Array, ""] | None = None,
     ) -> Float[Array, "recordings rows *axes"]:
         """Filtered signals, with zeros for missing samples and rows.
 
         **Arguments:**
 
-        - `late`: time by which the signals are delayed, s; at most a few periods of the cutoff.
+        - `ahead`: time by which the signals are advanced, s; at most a few periods of the cutoff.
         """
         axes = (1,) * (x.ndim - 2)
         size = 2 * (self.gain.shape[1] - 1)
-        gain = self.gain.astype(x.dtype)
-        if late is not None:
-            frequency = jnp.arange(self.gain.shape[1]) * self.rate[:, None] / size
-            gain = gain * jnp.exp(-2j * jnp.pi * frequency * late)
-        wave = jnp.fft.rfft(x, size, axis=1) * gain.reshape(*gain.shape, *axes)
+        gain = (self if ahead is None else self.advanced(ahead)).gain
+        wave = jnp.fft.rfft(x, size, axis=1)
+        wave = wave * gain.astype(wave.dtype).reshape(*gain.shape, *axes)
         passed = self.picked(jnp.fft.irfft(wave, size, axis=1))
         return passed * self.keep.reshape(*self.keep.shape, *axes)
+
+    def advanced(self, time: Float[Array, ""]) -> "Band":
+        """The band of signals that are advanced by a time, s; its gain is complex."""
+        size = 2 * (self.gain.shape[1] - 1)
+        frequency = jnp.arange(self.gain.shape[1]) * self.rate[:, None] / size
+        return dataclasses.replace(self, gain=self.gain * jnp.exp(2j * jnp.pi * frequency * time))
 
     def picked(
         self, x: Shaped[Array, "recordings samples *axes"]

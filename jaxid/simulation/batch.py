@@ -67,7 +67,7 @@ class Batch(eqx.Module):
         return self.mask if self.band is None else self.band.keep
 
     def compared(
-        self, x: Float[Any, "recordings samples *axes"], late: Float[Array, ""] | None = None
+        self, x: Float[Any, "recordings samples *axes"], ahead: Float[Array, ""] | None = None
     ) -> Float[Any, "recordings rows *axes"]:
         """The part of signals at the samples that is compared.
 
@@ -75,9 +75,9 @@ class Batch(eqx.Module):
 
         **Arguments:**
 
-        - `late`: the controller's delay for measured signals; None for simulated ones.
+        - `ahead`: the controller's delay for simulated signals; None for measured ones.
         """
-        return compared_part(self.band, self.moving, jnp.asarray(x), late)
+        return compared_part(self.band, self.moving, jnp.asarray(x), ahead)
 
     def uncompared(self) -> "Batch":
         """The batch for a simulation: what is compared would only make programs differ."""
@@ -364,14 +364,14 @@ def compared(
     loop: ClosedLoop,
     recordings: Recordings | Sequence[Recording],
     signals: Sequence[Float[np.ndarray, "_samples joints"]],
-    late: Float[Array, ""] | None = None,
+    ahead: Float[Array, ""] | None = None,
 ) -> list[Float[np.ndarray, "_samples joints"]]:
     """The part of signals that is compared under the controller, for each recording.
 
     **Arguments:**
 
     - `signals`: one for each recording, `(samples, joints)`.
-    - `late`: the controller's delay for measured signals; None for simulated ones.
+    - `ahead`: the controller's delay for simulated signals; None for measured ones.
     """
     band = band_of(loop, recordings)
     moving = moving_of(loop, recordings, band)
@@ -379,7 +379,7 @@ def compared(
     if band is not None:
         longest = max(len(x) for x in found)
         padded = np.stack([np.pad(x, ((0, longest - len(x)), (0, 0))) for x in found])
-        passed, keep = np.asarray(compared_part(band, None, padded, late)), np.asarray(band.keep)
+        passed, keep = np.asarray(compared_part(band, None, padded, ahead)), np.asarray(band.keep)
         found = [x[kept] for x, kept in zip(passed, keep, strict=True)]
     if moving is not None:
         found = [x * there[: len(x)] for x, there in zip(found, np.asarray(moving), strict=True)]

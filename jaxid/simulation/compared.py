@@ -19,16 +19,16 @@ def compared_part(
     band: Band | None,
     moving: Moving,
     x: Float[Any, "recordings samples *axes"],
-    late: Float[Array, ""] | None = None,
+    ahead: Float[Array, ""] | None = None,
 ) -> Float[Array, "recordings rows *axes"]:
     """Signals in the band; zero where a joint stands still.
 
     **Arguments:**
 
     - `moving`: the rows in which each joint moves; None for all.
-    - `late`: time by which signals in a band are delayed, s.
+    - `ahead`: time by which signals in a band are advanced, s.
     """
-    passed = x if band is None else band(x, late)
+    passed = x if band is None else band(x, ahead)
     if moving is None:
         return passed
     # The outputs may be several signals of each joint.

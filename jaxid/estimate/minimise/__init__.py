@@ -20,9 +20,9 @@ from .problem import residual_at as residual_at
 from .problem import reweighted as reweighted
 from .residual import Sensitivity as Sensitivity
 from .residual import absorb_start as absorb_start
-from .residual import measured_with_slopes as measured_with_slopes
 from .residual import raw_residual as raw_residual
 from .residual import sensitivity as sensitivity
+from .residual import simulated_with_slopes as simulated_with_slopes
 from .residual import unfiltered as unfiltered
 from .search import Nielsen as Nielsen
 from .solver import LevenbergMarquardt as LevenbergMarquardt

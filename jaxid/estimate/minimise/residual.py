@@ -121,36 +121,34 @@ def sensitivity_from(
 
     seen, slopes, *end, result = each(one, batch.intervals, batch.at, x, tangents)
     scale = weights * batch.mask[..., None]
-    measured, by_delay = measured_with_slopes(loop, batch, scale, signals)
-    residual = measured - batch.compared(seen * scale)
-    slopes = -batch.compared(slopes * scale[..., None])
+    measured = jnp.concatenate([getattr(batch, s) for s in signals], axis=-1)
+    simulated, by_delay = simulated_with_slopes(loop, batch, seen * scale)
+    residual = batch.compared(measured * scale) - simulated
+    slopes = -batch.compared(slopes * scale[..., None], loop.controller.late)
     by_start = slopes[..., p:] if slopes.shape[-1] > p else None
-    return Sensitivity(residual, residual, slopes[..., :p] + by_delay, by_start, result), *end
+    return Sensitivity(residual, residual, slopes[..., :p] - by_delay, by_start, result), *end
 
 
-def measured_with_slopes(
-    loop: ClosedLoop,
-    batch: Batch,
-    scale: Float[Array, "recordings samples outputs"],
-    signals: tuple[str, ...],
+def simulated_with_slopes(
+    loop: ClosedLoop, batch: Batch, x: Float[Array, "recordings samples outputs"]
 ) -> tuple[
     Float[Array, "recordings rows outputs"], Float[Array, "#recordings #rows #outputs parameters"]
 ]:
-    """Measured signals as they are compared, and their derivatives by the loop's parameters.
+    """Simulated signals as they are compared, and their derivatives by the delay of the torque.
 
-    Of all parameters only the delay of the torque changes them.
+    The simulated signals are advanced. If the measured ones were delayed, their noise would depend
+    on the delay, and a fit would choose the delay with the smallest noise.
 
     **Arguments:**
 
-    - `scale`: factor of each sample; zero at padding. `signals`: as for `sensitivity`.
+    - `x`: simulated signals, zero at padding.
     """
-    x = jnp.concatenate([getattr(batch, s) for s in signals], axis=-1) * scale
     if batch.band is None:
         return batch.compared(x), jnp.zeros((1, 1, 1, loop.theta.shape[0]))
     late, one = loop.controller.late, jnp.ones(())
-    measured, by_delay = jax.jvp(lambda late: batch.compared(x, late), (late,), (one,))
+    simulated, by_delay = jax.jvp(lambda late: batch.compared(x, late), (late,), (one,))
     change = jax.jacfwd(lambda theta: loop.with_theta(theta).controller.late)(loop.theta)
-    return measured, by_delay[..., None] * change
+    return simulated, by_delay[..., None] * change
 
 
 def raw_residual(
@@ -170,7 +168,7 @@ def raw_residual(
     seen = each(one, batch.intervals, batch.at, batch.q0, batch.v0)
     scale = weights * batch.mask[..., None]
     measured = jnp.concatenate([getattr(batch, s) for s in signals], axis=-1)
-    return batch.compared(measured * scale, loop.controller.late) - batch.compared(seen * scale)
+    return batch.compared(measured * scale) - batch.compared(seen * scale, loop.controller.late)
 
 
 def through_filter(
