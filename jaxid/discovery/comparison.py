@@ -21,7 +21,7 @@ from ..estimate.regression import filtered
 from ..estimate.result import errors_to_dict, joint_columns, relative_errors
 from ..noise import autocorrelation
 from ..recording import Recording, Recordings
-from ..simulation.batch import band_of, compared, prepare
+from ..simulation.batch import band_of, compared_torques, prepare
 from ..simulation.integration import reason
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import BY_SAMPLE, Simulated, by_recording, simulate_batch
@@ -78,10 +78,9 @@ class Comparison(AbstractShown):
         if self.signal == "position":
             return record.time, record.q, np.asarray(run.q)
         band = band_of(self.loop, self.recordings)
-        loop, records = self.loop, self.recordings
         torques = [np.asarray(x.tau) for x in self.runs]
-        measured = compared(loop, records, [r.tau for r in records])[k]
-        simulated = compared(loop, records, torques, loop.controller.late)[k]
+        both = compared_torques(self.loop, self.recordings, torques)
+        measured, simulated = (signals[k] for signals in both)
         if band is None:
             return record.time, measured, simulated
         rows = np.asarray(band.rows)[k][np.asarray(band.keep)[k]]
@@ -299,10 +298,8 @@ def _errors(
         [np.asarray(v) - np.asarray(run.v) for v, run in zip(velocity, runs, strict=True)],
     )
     if not isinstance(loop.controller, OpenLoop):
-        torques = [np.asarray(run.tau) for run in runs]
-        torque = compared(loop, recordings, [r.tau for r in recordings])
-        simulated = compared(loop, recordings, torques, loop.controller.late)
-        left = [x - y for x, y in zip(torque, simulated, strict=True)]
+        both = compared_torques(loop, recordings, [np.asarray(run.tau) for run in runs])
+        torque, left = both[0], [x - y for x, y in zip(*both, strict=True)]
         tables["torque"] = relative_errors(recordings, torque, left)
     together = pd.concat(tables, names=["signal"]).reorder_levels(["recording", "signal"])
     columns = joint_columns(loop.joints)

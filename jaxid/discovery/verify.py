@@ -71,6 +71,7 @@ class Refits(eqx.Module):
         return self.best([found, again]) if again.status.simulated else found
 
     def _with_one_sign(self, loop: ClosedLoop, noise: Sequence[ARFilter]) -> Fit:
+        """A fit, repeated until the frictions of each joint have one sign."""
         found = self._filtered(loop, noise)
         for _ in range(_SIGN_TURNS):
             if not found.status.simulated or has_one_sign(found.loop):

@@ -115,6 +115,7 @@ class WhatIf(eqx.Module):
         system, batch = predictor.system, predictor.system.batch
         signal = batch.tau if system.row == 0 else batch.q
         measured = np.asarray(signal) * np.asarray(batch.mask)[..., None]
+        # The system's band advances simulated signals by the delay; measured ones stay.
         measured = np.asarray(batch.compared(measured, -of.loop.controller.late))
         measured = measured * system.mask[..., None]
         time = np.asarray(at_rows(batch, system.linear.motion.t))

@@ -12,7 +12,7 @@ from ..compiling import compiled
 from ..errors import FitError
 from ..parameters import Bounds, write_values
 from ..recording import Recordings
-from ..simulation.batch import compared
+from ..simulation.batch import compared_torques
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import Simulated, simulate
 from .idim import Solved, Stacked, Weights, regression_fit, solve, stack
@@ -50,10 +50,8 @@ def _explaining(recordings: Recordings, runs: tuple[Simulated, ...]) -> list[Sim
 
 def _explained(loop: ClosedLoop, recordings: Recordings, runs: tuple[Simulated, ...]) -> bool:
     """Whether the residual of every joint is smaller than its measured torque."""
-    torques = [np.asarray(run.tau) for run in runs]
-    measured = compared(loop, recordings, [r.tau for r in recordings])
-    simulated = compared(loop, recordings, torques, loop.controller.late)
-    pairs = list(zip(measured, simulated, strict=True))
+    torques = compared_torques(loop, recordings, [np.asarray(run.tau) for run in runs])
+    pairs = list(zip(*torques, strict=True))
     left = sum(np.sum((m - s) ** 2, axis=0) for m, s in pairs)
     return bool(np.all(left <= 1.05**2 * sum(np.sum(m**2, axis=0) for m, _ in pairs)))
 

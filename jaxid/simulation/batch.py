@@ -384,3 +384,18 @@ def compared(
     if moving is not None:
         found = [x * there[: len(x)] for x, there in zip(found, np.asarray(moving), strict=True)]
     return found
+
+
+def compared_torques(
+    loop: ClosedLoop,
+    recordings: Recordings | Sequence[Recording],
+    simulated: Sequence[Float[np.ndarray, "_samples joints"]],
+) -> tuple[list[Float[np.ndarray, "_samples joints"]], ...]:
+    """Measured and simulated torque as they are compared, N·m or N, for each recording.
+
+    **Arguments:**
+
+    - `simulated`: the torque of a simulation of each recording, `(samples, joints)`.
+    """
+    measured = compared(loop, recordings, [r.tau for r in recordings])
+    return measured, compared(loop, recordings, simulated, loop.controller.late)

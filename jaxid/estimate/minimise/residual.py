@@ -141,7 +141,7 @@ def simulated_with_slopes(
 
     **Arguments:**
 
-    - `x`: simulated signals, zero at padding.
+    - `x`: weighted simulated signals, `(recordings, samples, outputs)`, zero at padding.
     """
     if batch.band is None:
         return batch.compared(x), jnp.zeros((1, 1, 1, loop.theta.shape[0]))
