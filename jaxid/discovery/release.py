@@ -59,7 +59,7 @@ def released(predictor: Predictor, price: float) -> Release | None:
     free = loop.with_values(**values).free(*held)
     if held:
         change = _signal(predictor, loop.with_values(**values)) - nominal
-        gain = _fall(predictor, _gain(predictor, _compared(predictor, change)))
+        gain = _fall(predictor, _beside(predictor)(_compared(predictor, change)))
         return Release(free, f"{' and '.join(held)} estimated", gain)
     start = ", ".join(f"{name} {value:.3g}" for name, value in values.items())
     least = _fall(predictor, price)
@@ -77,6 +77,7 @@ def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str
     names = {p.place: p.name for p in loop.parameters}
     found: dict[str, float] = {}
     tried: set[tuple] = set()
+    beside = _beside(predictor)
     for p in (*doubtful(loop), *_estimated_signs(loop)):
         together = [names[(*p.place[:2], what)] for what in SIGN if p.place[2:] in OF_SIGN]
         free = p.place in {q.place for q in loop.free_parameters}
@@ -85,12 +86,12 @@ def _shapes(predictor: Predictor, nominal: np.ndarray, price: float) -> dict[str
         if p.name in found or setting in tried:
             continue
         tried.add(setting)
-        gain = _instead(p) if free else _gain
+        gain = _instead(predictor, p) if free else beside
         best: dict[str, float] = {}
         most = price
         settings = _settings(p, together, loop)
         for values, change in zip(settings, _changes(predictor, p, settings, nominal), strict=True):
-            if np.isfinite(change).all() and (explained := gain(predictor, change)) > most:
+            if np.isfinite(change).all() and (explained := gain(change)) > most:
                 best, most = values, explained
         found |= best
     return found
@@ -126,23 +127,23 @@ def _estimated_signs(loop: ClosedLoop) -> list[Parameter]:
     return [p for p in loop.free_parameters if p.place[2:] in OF_SIGN and not follows(p, loop)]
 
 
-def _instead(sign: Parameter) -> Callable[[Predictor, np.ndarray], float]:
+def _instead(predictor: Predictor, sign: Parameter) -> Callable[[np.ndarray], float]:
     """The function for what a change of a free sign explains.
 
     The derivatives of the sign are removed from the base first, because they absorb the change.
     """
+    data, noise = predictor.data, predictor.noise
+    free = predictor.system.loop.free_parameters
+    owner = [p.place[:2] == sign.place[:2] and p.place[2:] in OF_SIGN for p in free]
+    gone = np.repeat(owner, [p.size for p in free])
+    kept = np.concatenate([~gone, np.ones(data.base.shape[-1] - len(gone), bool)])
+    white = data.white(data.base[..., kept], noise)
+    basis = spanned(white.reshape(-1, white.shape[-1]))
+    now = _white(predictor, data.residual)
 
-    def gain(predictor: Predictor, change: np.ndarray) -> float:
-        free = predictor.system.loop.free_parameters
-        owner = [p.place[:2] == sign.place[:2] and p.place[2:] in OF_SIGN for p in free]
-        gone = np.repeat(owner, [p.size for p in free])
-        base = predictor.data.base
-        kept = base[..., np.concatenate([~gone, np.ones(base.shape[-1] - len(gone), bool)])]
-        white = predictor.data.white(kept, predictor.noise)
-        basis = spanned(white.reshape(-1, white.shape[-1]))
-        rest = predictor.data.white(predictor.data.residual - change, predictor.noise).reshape(-1)
+    def gain(change: np.ndarray) -> float:
+        rest = data.white(data.residual - change, noise).reshape(-1)
         rest = rest - basis @ (basis.T @ rest)
-        now = _white(predictor, predictor.data.residual)
         return float(now @ now - rest @ rest)
 
     return gain
@@ -201,18 +202,16 @@ def _fall(predictor: Predictor, gain: float) -> float:
     return rows * float(np.log(left / max(left - gain, 1e-9 * left)))
 
 
-def _gain(predictor: Predictor, change: np.ndarray) -> float:
-    """What a compared change explains of the squared error, at its own or the best size."""
-    along, gain = _held_against(predictor, change)
-    size = gain / max(along**2, 1e-300)
-    return max((2 * along - 1) * size, gain if along > 0 else 0.0)
+def _beside(predictor: Predictor) -> Callable[[np.ndarray], float]:
+    """The function for what a change explains, at its own or the best size, beside the base."""
+    residual = _white(predictor, predictor.data.residual)
 
+    def gain(change: np.ndarray) -> float:
+        shown = _white(predictor, change)
+        along, size = float(residual @ shown), max(float(shown @ shown), 1e-300)
+        return max(2 * along - size, along**2 / size if along > 0 else 0.0)
 
-def _held_against(predictor: Predictor, change: np.ndarray) -> tuple[float, float]:
-    """The best multiple of a compared change, and what it explains of the squared error."""
-    shown, residual = (_white(predictor, x) for x in (change, predictor.data.residual))
-    along, size = float(residual @ shown), max(float(shown @ shown), 1e-300)
-    return along / size, along**2 / size
+    return gain
 
 
 def _compared(predictor: Predictor, change: np.ndarray) -> np.ndarray:
