@@ -22,7 +22,7 @@ from jaxid.effects import recording_label
 from jaxid.errors import FitError
 from jaxid.estimate.regression import decimator, filtered, linear_parameters, regression
 from jaxid.parameters import list_parameters, read_values, write_values
-from jaxid.simulation.dynamics import inverse
+from jaxid.simulation.loads import inverse
 from jaxid.simulation.runs import Simulated
 
 Key = tuple[str, int | None]

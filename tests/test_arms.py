@@ -16,7 +16,7 @@ from jaxid.control import OpenLoop
 from jaxid.effects import AbstractEffect, Coulomb, Motion, Viscous, smooth_sign
 from jaxid.errors import ModelError
 from jaxid.parameters import list_parameters, read_values
-from jaxid.simulation.dynamics import inverse
+from jaxid.simulation.loads import inverse
 
 G = 9.81
 LENGTH = 0.5

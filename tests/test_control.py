@@ -15,7 +15,7 @@ import jaxid
 from jaxid.control import PD, Cascade, OpenLoop, Sampled, Tracking
 from jaxid.effects import Motion
 from jaxid.errors import ModelError, RecordingError
-from jaxid.simulation.dynamics import inverse
+from jaxid.simulation.loads import inverse
 
 GAINS = {"Kp": (6.25, 156.25), "Kv": (2.0, 25.0), "Kg": (3.5, 0.06)}
 # Lines of at most 6 rad/s, faded in within 1 s.

@@ -26,7 +26,8 @@ from jaxid.effects import (
 )
 from jaxid.errors import ModelError
 from jaxid.parameters import Scalar, parameter
-from jaxid.simulation.dynamics import Outside, instant, inverse
+from jaxid.simulation.dynamics import Outside, instant
+from jaxid.simulation.loads import inverse
 from jaxid.simulation.state import rest
 
 

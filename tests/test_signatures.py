@@ -13,7 +13,7 @@ import jaxid
 from jaxid.discovery.finite import differences
 from jaxid.discovery.hypotheses import amplitudes, survey
 from jaxid.discovery.linear import linearise
-from jaxid.discovery.signatures import Placed, force_and_slopes, signatures
+from jaxid.discovery.signatures import force_and_slopes, signatures
 from jaxid.effects import (
     AbstractEffect,
     ActuatorLag,
@@ -24,6 +24,7 @@ from jaxid.effects import (
     JointElasticity,
     LoadDependentFriction,
     Motion,
+    Placed,
     PositionDependentFriction,
     Spring,
     Stribeck,

@@ -15,6 +15,7 @@ from ..estimate import OEM, Status
 from ..estimate.standstill import slow_note, worst_at_standstill
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
+from ..simulation.sharing import with_one_blas_thread
 from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
 from .alongside import along_recorded, in_the_loop
@@ -45,6 +46,7 @@ _STOPPED = "the search was interrupted; resume=... continues it from its saved s
 _SHOWN = 0.01
 
 
+@with_one_blas_thread
 def discover(
     loop: ClosedLoop,
     recordings: Recording | Recordings | Iterable[Recording],

@@ -25,6 +25,7 @@ from ..simulation.batch import band_of, compared_torques, prepare
 from ..simulation.integration import reason
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import BY_SAMPLE, Simulated, by_recording, simulate_batch
+from ..simulation.sharing import with_one_blas_thread
 from ..simulation.steps import with_substeps
 from ..storage.saved import save
 
@@ -198,6 +199,7 @@ class Comparison(AbstractShown):
         return f"<p>{head}</p>{self.errors.to_html(float_format='%.4g')}"
 
 
+@with_one_blas_thread
 def compare(
     model: Fit | ClosedLoop,
     recordings: Recording | Recordings | Iterable[Recording],

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..display.shown import AbstractShown
-from ..effects import AbstractEffect, AbstractTransmission, Curve, Motion, recording_label
+from ..effects import AbstractEffect, AbstractTransmission, Curve, Motion, Placed, recording_label
 from ..effects.curve import coordinate_unit
 from ..errors import ModelError
 from ..estimate import Fit
@@ -21,7 +21,7 @@ from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from .comparison import Comparison, compare
 from .hypotheses import effect_on
-from .signatures import Placed, force_and_slopes, left_for_links, misreads
+from .signatures import force_and_slopes, left_for_links, misreads
 from .text import WIDTH
 
 if TYPE_CHECKING:

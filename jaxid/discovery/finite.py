@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..compiling import compiled
-from ..effects import AbstractEffect, AbstractTransmission, TorqueSaturation
+from ..effects import AbstractEffect, AbstractTransmission, TorqueSaturation, by_structure
 from ..parameters import KNOWN
 from ..simulation.batch import Batch
 from ..simulation.dynamics import imposed
@@ -101,8 +101,8 @@ def _simulated(
     shared = [k for k, e in enumerate(effects) if isinstance(e, _SHARED)]
     groups = [(shared, _together([effects[k] for k in shared]))] if shared else []
     others = [k for k in range(len(effects)) if k not in shared]
-    for alike in by_structure([effects[k] for k in others]):
-        places = [others[k] for k in alike]
+    for group in by_structure([effects[k] for k in others]):
+        places = [others[k] for k in group]
         groups.append((places, [(effects[k],) for k in places]))
     jobs = []
     for places, settings in groups:
@@ -156,16 +156,6 @@ def _together(effects: Sequence[AbstractEffect]) -> list[tuple[AbstractEffect, .
 def _one_of(options: tuple[AbstractTransmission, ...], chosen: int) -> OneOf:
     joint, number = options[0].joint, jnp.asarray(chosen)
     return OneOf(joint=joint, options=options, chosen=number)  # type: ignore[reportCallIssue]
-
-
-def by_structure(effects: Sequence[eqx.Module]) -> list[list[int]]:
-    """Places of effects, grouped by structure; one trace serves a group."""
-    groups: dict[Any, list[int]] = {}
-    for k, effect in enumerate(effects):
-        leaves, structure = jax.tree.flatten(effect)
-        key = (structure, tuple(np.shape(leaf) for leaf in leaves))
-        groups.setdefault(key, []).append(k)
-    return list(groups.values())
 
 
 @compiled

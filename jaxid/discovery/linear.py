@@ -13,8 +13,9 @@ from ..compiling import compiled
 from ..effects import AbstractTransmission, Motion
 from ..simulation.batch import Batch, Interval
 from ..simulation.compared import compared_table
-from ..simulation.dynamics import imposed, link_load
+from ..simulation.dynamics import imposed
 from ..simulation.integration import SIGNALS, initial
+from ..simulation.loads import link_load
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import advance, at_points, each, run
 from ..simulation.sharing import one_by_one

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, Placed
 from ..estimate.minimise import Filling, Stopping, Sums, descend
 from ..noise import ARFilter
 from ..parameters import Bounds, read_values, write_values
@@ -23,7 +23,7 @@ from .finite import differences
 from .hypotheses import free_of
 from .linear import Place, at_samples, respond
 from .score import Data, spanned
-from .signatures import Placed, force_and_slopes, torques_of
+from .signatures import force_and_slopes, torques_of
 from .system import System
 
 # Columns of one response. Missing columns are filled with zeros, so that few programs are compiled.

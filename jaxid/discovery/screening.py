@@ -16,6 +16,7 @@ from ..estimate import Fit
 from ..recording import Recordings
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
+from ..simulation.sharing import with_one_blas_thread
 from .comparison import Comparison
 from .diagnosis import Diagnosis
 from .hypotheses import Hypothesis, candidates, curves, survey
@@ -26,6 +27,7 @@ from .signatures import signatures
 from .system import System
 
 
+@with_one_blas_thread
 def diagnose(
     fit: Fit | Comparison,
     *,

@@ -8,18 +8,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from ..compiling import compiled
-from ..effects import AbstractEffect, Curve, Motion
+from ..effects import AbstractEffect, Motion, Placed, alike, along_effects
 from ..linear_algebra import exponential
 from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..simulation.batch import Batch
-from ..simulation.dynamics import effect_loads
+from ..simulation.loads import effect_loads
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import each
 from ..simulation.sharing import at_once, one_by_one, taken
-from .finite import by_structure, differences
+from .finite import differences
 from .hypotheses import Hypothesis, amplitudes, free_of
 from .linear import Linearised, respond
 
@@ -90,57 +90,6 @@ def _weights(slope: Float[Array, "states states"], known: _Weights) -> _Weights:
 
     apart = jnp.max(jnp.abs(slope - known.slope)) > _SAME * jnp.max(jnp.abs(slope))
     return jax.lax.cond(apart, computed, lambda: known)
-
-
-# What a curve may be over beside time, in the order in which `Placed` counts.
-_COORDINATES = ("q", "v", "a", "tau")
-
-
-class Placed(eqx.Module):
-    """An effect with its joints renumbered as the first ones, and the order of the joints.
-
-    The order of the joints is data, so one program serves an effect on any joint. The coordinate of
-    a curve is data as well: `along` is its index among time and the positions, velocities,
-    accelerations and torques of all joints, and takes the place of time.
-    """
-
-    effect: AbstractEffect
-    order: Int[Array | np.ndarray, " joints"]
-    along: Int[Array | np.ndarray, ""] | None = None
-
-    @classmethod
-    def of(cls, effect: AbstractEffect, joints: int) -> "Placed":
-        """An effect of an arm; unchanged if it does not declare the joints on which it depends."""
-        along = None
-        if isinstance(effect, Curve):
-            if effect.coordinate != "t":
-                place = _COORDINATES.index(effect.coordinate) * joints + effect.of
-                along = np.asarray(place)
-            else:
-                along = np.asarray(0)
-            effect = dataclasses.replace(effect, coordinate="t", of=effect.joint)
-        own = [getattr(effect, name) for name in effect.joint_fields]
-        first = list(dict.fromkeys(own))
-        others = [j for j in range(1, joints + 1) if j not in first]
-        moved = {n: first.index(j) + 1 for n, j in zip(effect.joint_fields, own, strict=True)}
-        made = dataclasses.replace(effect, **moved) if moved else effect
-        return cls(made, np.asarray([j - 1 for j in (*first, *others)]), along)
-
-    def motion(self, motion: Motion) -> Motion:
-        """A motion with the effect's joints first."""
-        if self.along is not None:
-            signals = [getattr(motion, name) for name in _COORDINATES]
-            every = jnp.concatenate([motion.t[..., None], *signals], axis=-1)
-            motion = eqx.tree_at(lambda m: m.t, motion, every[..., self.along])
-
-        def rows(m):
-            return jax.tree.leaves((m.q, m.v, m.a, m.tau, m.held, m.load))
-
-        return eqx.tree_at(rows, motion, [x[..., self.order] for x in rows(motion)])
-
-    def back(self, forces: Any) -> Any:
-        """Results in that order of joints, `(points, joints, ...)`, in the arm's order."""
-        return jax.tree.map(lambda x: x[:, jnp.argsort(self.order)], forces)
 
 
 Forces = tuple[
@@ -222,7 +171,7 @@ def _force_and_slopes(
     values = read_values(effect, free) if free else jnp.zeros(0)
 
     def of_run(run: Motion, left) -> Forces:
-        along = _force_by(effect, free, placed.motion(run), left[:, placed.order])
+        along = _force_by(effect, free, placed.motion(run), left[:, placed.own])
         both = along(values), jax.jacfwd(along)(values)
         found = jax.tree.map(lambda x, d: jnp.concatenate([x[..., None], d], -1), *both)
         return placed.back(found)
@@ -239,7 +188,7 @@ def torques_of(
 
     **Arguments:** as for `force_and_slopes`.
     """
-    ((stacked, _),) = _grouped(effects, motion.q.shape[-1])
+    ((stacked, _),) = alike(effects, motion.q.shape[-1])
     return one_by_one(lambda one: _torques_of(stacked, one[0], one[1]), (motion, left))
 
 
@@ -249,10 +198,10 @@ def _torques_of(
 ) -> Float[Array, "recordings points joints effects"]:
     def of_run(run: Motion, left):
         def own(placed: Placed):
-            by = _force_by(placed.effect, (), placed.motion(run), left[:, placed.order])
+            by = _force_by(placed.effect, (), placed.motion(run), left[:, placed.own])
             return placed.back(by(jnp.zeros(0))[0])
 
-        return jnp.moveaxis(eqx.filter_vmap(own, in_axes=eqx.if_array(0))(stacked), 0, -1)
+        return jnp.moveaxis(along_effects(own, stacked), 0, -1)
 
     return each(of_run, motion, left)
 
@@ -265,7 +214,7 @@ def left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings
 @compiled
 def _left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recordings points joints"]:
     def remaining(at: Motion, states: tuple[Float[Array, " _"], ...]):
-        return at.tau - effect_loads(loop, at, states)[0]
+        return at.tau - effect_loads(loop, at, states, grouped=True)[0]
 
     def along(run: Motion):
         states = tuple(_settled_states(effect, run) for effect in loop.effects)
@@ -291,10 +240,10 @@ def _all_forces(
         for stacked in groups:
 
             def own(placed: Placed) -> Forces:
-                moved, rest = placed.motion(run), left[:, placed.order]
+                moved, rest = placed.motion(run), left[:, placed.own]
                 return placed.back(_forces(placed.effect, moved, rest))
 
-            forces = eqx.filter_vmap(own, in_axes=eqx.if_array(0))(stacked)
+            forces = along_effects(own, stacked)
             push, noise, rate = (_by_point(x.astype(jnp.float32)) for x in forces)
             pushes.append(push)
             if misreads(stacked.effect):
@@ -318,15 +267,6 @@ def _by_point(x: Float[Array, "settings points joints columns"]) -> Float[Array,
 def misreads(effect: AbstractEffect) -> bool:
     """Whether the effect acts on a sensor's reading."""
     return type(effect).read is not AbstractEffect.read
-
-
-def _grouped(effects: Sequence[AbstractEffect], joints: int) -> list[tuple[Placed, list[int]]]:
-    """Effects that share one program, stacked, with their places."""
-    placed = [Placed.of(effect, joints) for effect in effects]
-    return [
-        (jax.tree.map(lambda *leaves: np.stack(leaves), *(placed[k] for k in places)), places)
-        for places in by_structure(placed)
-    ]
 
 
 def _responses(
@@ -380,7 +320,7 @@ def signatures(
     direct = [k for k, (effect, _) in enumerate(proposed) if not effect.finite]
     made: dict[int, Hypothesis] = {}
     blocks, at = [], 0
-    groups = _grouped([proposed[k][0] for k in direct], loop.joints)
+    groups = alike([proposed[k][0] for k in direct], loop.joints)
     if groups:
         say(f"{len(direct)} signatures by linear response")
         for _, places in groups:

@@ -12,7 +12,7 @@ from ..compiling import compiled
 from ..effects import Motion
 from ..errors import FitError
 from ..recording import Recording
-from ..simulation.dynamics import inverse
+from ..simulation.loads import inverse
 from ..simulation.loop import ClosedLoop
 from .regression import effect_states
 from .result import determined_covariance

@@ -17,6 +17,7 @@ from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
 from ..simulation.batch import at_rest, check_joints, check_law
 from ..simulation.loop import ClosedLoop
+from ..simulation.sharing import with_one_blas_thread
 from .drawn import contradiction
 from .mistakes import LARGE_PERCENT, at_limit, likely_mistake
 from .oem import OEM, oem_of
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+@with_one_blas_thread
 def fit(
     loop: ClosedLoop,
     recordings: Recording | Recordings | Iterable[Recording],

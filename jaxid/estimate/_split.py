@@ -17,7 +17,7 @@ from ..errors import FitError
 from ..parameters import Bounds, list_parameters, read_values, write_values
 from ..recording import Recording, Recordings
 from ..signals.smoothing import evened
-from ..simulation.dynamics import effect_loads
+from ..simulation.loads import effect_loads
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import Simulated
 from ._encoder import Kernels, errors_of, row_errors, solve_weighted
@@ -81,7 +81,7 @@ def split_torque(loop: ClosedLoop, at: Motion, once: bool) -> Float[Array, "4 sa
         first = split.first @ values
         if once:
             twice, first = jnp.zeros_like(twice), first + rate
-        drive, link = effect_loads(loop, delivered, own)
+        drive, link = effect_loads(loop, delivered, own, grouped=True)
         zeroth = split.zeroth @ values + drive + link
         return jnp.stack([twice, first, zeroth, -delivered.tau])
 

@@ -15,7 +15,7 @@ from ..errors import FitError
 from ..parameters import Parameter, read_values, write_values
 from ..recording import Recording
 from ..signals.smoothing import even_times, resampled, signal_cutoff, smooth_motion
-from ..simulation.dynamics import inverse
+from ..simulation.loads import inverse
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import Simulated
 

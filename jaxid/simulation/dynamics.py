@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 from ..arms import AbstractArm
 from ..control import Reading, Reference
 from ..effects import AbstractEffect, AbstractTransmission, DriveGain, Motion
+from .loads import effect_loads
 from .loop import ClosedLoop
 from .state import State, behind, read
 
@@ -110,83 +111,6 @@ class Instant(eqx.Module):
     tau: Float[Array, " joints"]
     a: Float[Array, " joints"]
     derivative: State
-
-
-def effect_loads(
-    loop: ClosedLoop,
-    motion: Motion,
-    states: tuple[Float[Array, " _"], ...],
-    links: Motion | None = None,
-    *,
-    push: Float[Array, " joints"] | float = 0.0,
-    curves: bool = True,
-    inertia: bool = True,
-) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
-    """Torque that effects on the drives and on the links require, `(joints,)` each.
-
-    Load-dependent effects come last, because they depend on the torque minus all other effects.
-    Acceleration is solved for, so terms proportional to it are not subtracted.
-
-    **Arguments:**
-
-    - `motion`: motion of the drives. `states`: the effects' own states. `links`: motion of the
-      links, if it differs from that of the drives.
-    - `push`: external torque on the drives, which load-dependent effects include.
-    - `curves`: False to leave out effects that need an acceleration which is not known yet.
-    - `inertia`: False to leave out terms proportional to acceleration.
-    """
-    drive = link = ahead = jnp.zeros_like(motion.v)
-    behind = motion if links is None else links
-    own = [
-        (effect, state)
-        for effect, state in zip(loop.effects, states, strict=True)
-        if curves or not effect.needs_acceleration
-    ]
-    for effect, state in own:
-        if effect.loaded:
-            continue
-        seen = dataclasses.replace(behind if effect.on_link else motion, state=state)
-        if effect.inertial and not inertia:
-            seen = dataclasses.replace(seen, a=jnp.zeros_like(seen.a))
-        torque = effect.torque(seen)
-        if effect.on_link:
-            link = link + torque
-            continue
-        drive = drive + torque
-        if effect.inertial:
-            torque = effect.torque(dataclasses.replace(seen, a=jnp.zeros_like(seen.a)))
-        ahead = ahead + torque
-    loaded = [(effect, state) for effect, state in own if effect.loaded]
-    if loaded:
-        load = link_load(loop, behind, states)
-        left = dataclasses.replace(motion, tau=motion.tau - ahead + push, load=load)
-        for effect, state in loaded:
-            drive = drive + effect.torque(dataclasses.replace(left, state=state))
-    return drive, link
-
-
-def link_load(
-    loop: ClosedLoop, links: Motion, states: tuple[Float[Array, " _"], ...]
-) -> Float[Array, " joints"]:
-    """Torque that the links need at their position and velocity without accelerating, `(joints,)`.
-
-    **Arguments:**
-
-    - `links`: motion of the links. `states`: the effects' own states.
-    """
-    load, still = loop.arm.bias(links.q, links.v), jnp.zeros_like(links.q)
-    for effect, state in zip(loop.effects, states, strict=True):
-        if effect.on_link and not effect.needs_acceleration:
-            load = load + effect.torque(dataclasses.replace(links, a=still, state=state))
-    return load
-
-
-def inverse(
-    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...]
-) -> Float[Array, " joints"]:
-    """Torque at the joints that a motion needs (the inverse dynamic model), `(joints,)`."""
-    drive, link = effect_loads(loop, motion, states)
-    return loop.arm.inverse(motion.q, motion.v, motion.a) + drive + link
 
 
 def _added_inertia(
@@ -330,15 +254,15 @@ def _beside_bodies(
     outside: Outside,
 ) -> Float[Array, " joints"]:
     """Torque that a motion needs in addition to `rigid`, minus external torque."""
-    helped = outside.push + outside.pull
+    helped, grouped = outside.push + outside.pull, motion.imposed
     if any(effect.loaded for effect in loop.effects):
         # Load-dependent effects get the torque that the motion needs without them.
         pairs = zip(loop.effects, state.effects, strict=True)
         kept = [(e, s) for e, s in pairs if not e.loaded]
         others = loop.with_effects([e for e, _ in kept])
-        drive, link = effect_loads(others, motion, tuple(s for _, s in kept))
+        drive, link = effect_loads(others, motion, tuple(s for _, s in kept), grouped=grouped)
         motion = dataclasses.replace(motion, tau=rigid - helped + drive + link)
-    drive, link = effect_loads(loop, motion, state.effects, push=outside.push)
+    drive, link = effect_loads(loop, motion, state.effects, push=outside.push, grouped=grouped)
     return drive + link - helped
 
 

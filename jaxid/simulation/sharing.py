@@ -1,11 +1,13 @@
 """Distribution of recordings over the cores of this machine or the devices of a mesh."""
 
+import functools
+import importlib
 import math
 import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -13,7 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, PyTree
+from threadpoolctl import threadpool_limits
 
+_Arguments = ParamSpec("_Arguments")
 Given = TypeVar("Given")
 Result = TypeVar("Result")
 
@@ -24,6 +28,26 @@ def cores() -> int:
         return 1
     known = hasattr(os, "sched_getaffinity")
     return len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
+
+
+def with_one_blas_thread(
+    fun: Callable[_Arguments, Result],
+) -> Callable[_Arguments, Result]:
+    """The function with NumPy's and SciPy's linear algebra on one thread while it runs.
+
+    Threads of BLAS add in another order on each number of cores, and a search would then depend on
+    it. For matrices of the size of ours they also wait for each other, and for XLA's threads, for
+    longer than they compute: beside one other process a decomposition takes four times as long.
+    """
+
+    @functools.wraps(fun)
+    def limited(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Result:
+        # SciPy brings a BLAS of its own, which can be limited once it is loaded.
+        importlib.import_module("scipy.linalg")
+        with threadpool_limits(1, user_api="blas"):
+            return fun(*args, **kwargs)
+
+    return limited
 
 
 def of_this_machine(mesh: Mesh) -> bool:
