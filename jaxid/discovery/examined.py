@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, Scene
 from ..estimate import Fit
 from ..storage.campaign import Campaign
 from .asked import Asked
@@ -32,6 +32,8 @@ class Examined:
 
     # Fit and linear system of the last prediction.
     seen: tuple[Fit, Predictor]
+    # The recorded motion, as the last screening describes it.
+    scene: Scene
 
     def __init__(
         self,
@@ -84,6 +86,16 @@ class Examined:
         assert start is not None
         assert start.fit is not None
         return fit.loop.effects[len(start.fit.loop.effects) :]
+
+    def not_genuine(self, fit: Fit) -> tuple[AbstractEffect, ...]:
+        """The added effects of a fit that only approximate another effect; a note names them."""
+        effects, scene = fit.loop.effects, self.scene
+        found = tuple(
+            e for e in self.added(fit) if not e.genuine(scene, [x for x in effects if x is not e])
+        )
+        if found:
+            self.note(f"{listed(found)}: the fitted values are those of another effect")
+        return found
 
     def had(self, at: Model, effects: Sequence[AbstractEffect]) -> Model | None:
         """An earlier refit of a set with the same values released; None if there is none."""

@@ -146,7 +146,7 @@ def _added(
 def _better(
     search: Examined, best: Model, effects: Sequence[AbstractEffect], fitted: Callable[[], Fit]
 ) -> Model:
-    """The better one of a model and of a fit; a note tells if the fit fails.
+    """The better one of a model and of a fit; a note tells if the fit fails or is of no use.
 
     **Arguments:**
 
@@ -158,6 +158,6 @@ def _better(
     except (ModelError, FitError) as error:
         search.note(f"no fit with {listed(effects)}: {error}")
         return best
-    if not fit.status.simulated:
+    if not fit.status.simulated or search.not_genuine(fit):
         return best
     return min(best, search.visit(search.added(fit), fit), key=lambda m: m.score)

@@ -93,18 +93,19 @@ def _linearised(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
         forced = dataclasses.replace(interval, **outside)
         # A failed solve is not finite, so its result number is not needed.
         after, seen, _ = advance(many.with_theta(u[:p]), forced, x)
-        return jnp.concatenate([after, seen[row]])
+        return jnp.concatenate([after, seen[row]]), seen
 
     def at(interval, x):
         m = x.shape[0]
         u = jnp.concatenate([x, theta, ends.ravel()])
-        slope = jax.jacfwd(lambda w: one(w[m:], interval, w[:m]))(u)
-        return slope[:m, :m], slope[:m, m:], slope[m:, :m], slope[m:, m:]
+        slope, seen = jax.jacfwd(lambda w: one(w[m:], interval, w[:m]), has_aux=True)(u)
+        return slope[:m, :m], slope[:m, m:], slope[m:, :m], slope[m:, m:], seen
 
     def whole(intervals: Interval, q0, v0):
         x0 = initial(loop, intervals, q0, v0)
-        states, seen, _ = run(loop, intervals, x0)
-        a, b, c, d = at_points(many, at, intervals, states)
+        # The signals are those of `at`, so that the equations are compiled only once.
+        states, _, _ = run(loop, intervals, x0)
+        a, b, c, d, seen = at_points(many, at, intervals, states)
         start = jax.jacfwd(lambda z: initial(loop, intervals, z[:n], z[n:]))(
             jnp.concatenate([q0, v0])
         )

@@ -54,7 +54,7 @@ class Search(Examined):
     latest: tuple[Screened, Diagnosis] | None = None
     # Sets of the last prediction of which an effect does not explain stretches that were left out.
     without_support: frozenset[tuple] = frozenset()
-    # Those of which a fit determines no value of an effect.
+    # Those of which a fit determines no value of an effect, or finds values of another effect.
     loose: frozenset[tuple] = frozenset()
 
     def run(self, loop: ClosedLoop) -> tuple[Outcome, bool]:
@@ -125,6 +125,7 @@ class Search(Examined):
         self.watched.begin("screen", "where the model fails")
         screened = known or screen(fit, self.asked.catalogue, self.watched.say)
         diagnosis = judge(fit, screened, self.asked.significance)
+        self.scene = screened.scene
         self.forms = max(self.forms, forms_of(screened.hypotheses))
         self.diagnoses[key_of(effects)] = diagnosis.light()
         return screened, diagnosis
@@ -283,10 +284,13 @@ class Search(Examined):
         if not fit.status.simulated:
             return None
         loose = undetermined(fit, len(asked.effects))
+        if loose:
+            self.note(f"{listed(asked.effects)}: the fit determines no value of {listed(loose)}")
+        else:
+            loose = self.not_genuine(fit)
         if not loose:
             return self.visit(self.added(fit), fit)
         self.loose |= {asked.key}
-        self.note(f"{listed(asked.effects)}: the fit determines no value of {listed(loose)}")
         return with_fewer(self, at, fit, loose)
 
     def _without_one(self, at: Model) -> Model | None:

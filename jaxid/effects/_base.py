@@ -4,7 +4,7 @@ import dataclasses
 import math
 import re
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any, ClassVar
 
@@ -130,6 +130,17 @@ class AbstractEffect(eqx.Module):
         """
         linear = [p for p in list_parameters(self) if p.declaration.free and p.declaration.linear]
         return write_values(self, linear, factor * read_values(self, linear)) if linear else self
+
+    def genuine(self, scene: Scene, beside: Sequence["AbstractEffect"]) -> bool:
+        """Whether its values are those of this effect, not of another one that it approximates.
+
+        A search does not add an effect for which this is false. True by default.
+
+        **Arguments:**
+
+        - `scene`: the recorded motion. `beside`: the other effects of the model.
+        """
+        return True
 
     def initial_state(self) -> Float[Array, " states"]:
         """States of the effect at rest; none by default."""

@@ -1,6 +1,6 @@
 """Friction that depends on speed alone."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -76,6 +76,8 @@ class Coulomb(AbstractEffect):
 
 # Square of a relative speed at which a power of it still has a derivative by its exponent.
 _STILL = 1e-12
+# Share of a Stribeck peak below which the peak has ended.
+_ENDED = 0.25
 
 
 class Stribeck(AbstractEffect):
@@ -111,6 +113,17 @@ class Stribeck(AbstractEffect):
             for j in scene.joints
             for share in shares
         ]
+
+    def genuine(self, scene: Scene, beside: Sequence[AbstractEffect]) -> bool:
+        """Whether the peak ends in the lower half of the recorded speeds, or friction falls.
+
+        Otherwise the term only bends a rising curve, as drag does.
+        """
+        speeds = np.linspace(0.0, scene.speed[self.joint - 1], 200)[1:]
+        peak = np.exp(-((speeds / float(self.velocity)) ** float(self.exponent)))
+        own = [e for e in beside if isinstance(e, Viscous) and e.joint == self.joint]
+        curve = float(self.level) * peak + sum(float(e.coefficient) for e in own) * speeds
+        return bool(peak[len(peak) // 2] < _ENDED or np.any(np.diff(curve) < 0))
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """Fs exp(-|v/vs|^δs) sigma(v) on the joint, `(joints,)`."""
