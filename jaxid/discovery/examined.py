@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..effects import AbstractEffect, Scene
+from ..effects import AbstractEffect
 from ..estimate import Fit
 from ..storage.campaign import Campaign
 from .asked import Asked
@@ -32,8 +32,6 @@ class Examined:
 
     # Fit and linear system of the last prediction.
     seen: tuple[Fit, Predictor]
-    # The recorded motion, as the last screening describes it.
-    scene: Scene
 
     def __init__(
         self,
@@ -89,9 +87,14 @@ class Examined:
 
     def not_genuine(self, fit: Fit) -> tuple[AbstractEffect, ...]:
         """The added effects of a fit that only approximate another effect; a note names them."""
-        effects, scene = fit.loop.effects, self.scene
+        effects = fit.loop.effects
+        # All diagnoses describe the same recorded motion; before the first one none is known.
+        scenes = [d.scene for d in self.diagnoses.values()][:1]
         found = tuple(
-            e for e in self.added(fit) if not e.genuine(scene, [x for x in effects if x is not e])
+            e
+            for scene in scenes
+            for e in self.added(fit)
+            if not e.genuine(scene, [x for x in effects if x is not e])
         )
         if found:
             self.note(f"{listed(found)}: the fitted values are those of another effect")

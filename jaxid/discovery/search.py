@@ -125,7 +125,6 @@ class Search(Examined):
         self.watched.begin("screen", "where the model fails")
         screened = known or screen(fit, self.asked.catalogue, self.watched.say)
         diagnosis = judge(fit, screened, self.asked.significance)
-        self.scene = screened.scene
         self.forms = max(self.forms, forms_of(screened.hypotheses))
         self.diagnoses[key_of(effects)] = diagnosis.light()
         return screened, diagnosis

@@ -1,0 +1,66 @@
+"""Fitted effects whose values are those of another effect."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from stories import search_of
+
+from jaxid.effects import Scene, Stribeck, Viscous
+
+
+def scene_of(speed: float) -> Scene:
+    """Of a joint with this highest speed, rad/s."""
+    one = np.ones(1)
+    return Scene(
+        -one,
+        one,
+        speed * one,
+        one,
+        one,
+        one,
+        one,
+        0.005,
+        10.0,
+        ("a",),
+        ((),),
+        (),
+        0.0,
+        (False,),
+        (None,),
+    )
+
+
+@pytest.mark.parametrize(
+    ("level", "velocity", "exponent", "viscous", "expected"),
+    [
+        # A peak at low speed, also if the friction rises everywhere.
+        (1.0, 0.1, 2.0, 20.0, True),
+        (1.0, 0.6, 1.0, 20.0, True),
+        # Slow motion, in which friction falls up to the highest speed.
+        (1.0, 5.0, 1.0, 0.1, True),
+        # A bend of a rising curve: 3.85 v + 8.36 exp(-(v/3.29)^1.1), which a drag explains.
+        (8.36, 3.29, 1.1, 3.85, False),
+        (1.0, 1.5, 2.0, 20.0, False),
+    ],
+)
+def test_a_stribeck_term_ends_or_falls(level, velocity, exponent, viscous, expected):
+    term = Stribeck(joint=1, level=level, velocity=velocity, exponent=exponent)
+    beside = [Viscous(joint=1, coefficient=viscous), Viscous(joint=2, coefficient=99.0)]
+    assert term.genuine(scene_of(3.0), beside) is expected
+
+
+@pytest.mark.xdist_group("offset")
+def test_a_term_that_approximates_another_effect_is_not_taken(offset_case, offset_story):
+    """Its fit is discarded, however good it is, and a note says why."""
+    search, story = search_of(offset_case), offset_story[0]
+    search.visit((), story.steps[0].fit)
+    search.diagnoses[()] = story.steps[0].diagnosis
+    bend = Stribeck(joint=1, level=1e-3, velocity=1e3)
+    fit = story.steps[0].fit
+    last = dataclasses.replace(fit, loop=fit.loop.add(bend))
+    found = last.loop.effects[-1]
+    assert search.not_genuine(last) == (found,)
+    assert search.failures == (
+        "stribeck on joint 1: the fitted values are those of another effect",
+    )
