@@ -24,7 +24,6 @@ from jaxid.effects import (
     JointElasticity,
     LoadDependentFriction,
     Motion,
-    Placed,
     PositionDependentFriction,
     Spring,
     Stribeck,
@@ -33,6 +32,7 @@ from jaxid.effects import (
     TorqueSaturation,
     on_joint,
 )
+from jaxid.effects.placed import Placed
 from jaxid.simulation.batch import prepare
 from jaxid.simulation.runs import simulate_batch
 from jaxid.simulation.steps import set_substeps

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..display.shown import AbstractShown
-from ..effects import AbstractEffect, AbstractTransmission, Curve, Motion, Placed, recording_label
+from ..effects import AbstractEffect, AbstractTransmission, Curve, Motion, recording_label
 from ..effects.curve import coordinate_unit
+from ..effects.placed import Placed
 from ..errors import ModelError
 from ..estimate import Fit
 from ..recording import Recording, Recordings

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..compiling import compiled
-from ..effects import AbstractEffect, AbstractTransmission, TorqueSaturation, by_structure
+from ..effects import AbstractEffect, AbstractTransmission, TorqueSaturation
+from ..effects.placed import by_structure
 from ..parameters import KNOWN
 from ..simulation.batch import Batch
 from ..simulation.dynamics import imposed

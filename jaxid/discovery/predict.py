@@ -14,7 +14,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import AbstractEffect, Placed
+from ..effects import AbstractEffect
+from ..effects.placed import Placed
 from ..estimate.minimise import Filling, Stopping, Sums, descend
 from ..noise import ARFilter
 from ..parameters import Bounds, read_values, write_values

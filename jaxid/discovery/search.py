@@ -187,7 +187,7 @@ class Search(Examined):
             return None
         self.watched.begin("fit", f"fit with {release.said}", ROUND)
         found = self.fits.with_released(at.effects, release, noise)
-        if not found.status.simulated:
+        if not found.status.simulated or self.not_genuine(found):
             return None
         model = self.judged(self.added(found), found)
         least = DECISIVE if release.again else max(effect - DECISIVE, 0.0)

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..compiling import compiled
-from ..effects import AbstractEffect, Motion, Placed, alike, along_effects
+from ..effects import AbstractEffect, Motion
+from ..effects.placed import Placed, alike, along_effects
 from ..linear_algebra import exponential
 from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..simulation.batch import Batch

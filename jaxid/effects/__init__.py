@@ -8,10 +8,6 @@ from ._base import check_declared as check_declared
 from ._base import on_joint as on_joint
 from ._base import recording_label as recording_label
 from ._base import smooth_sign as smooth_sign
-from ._placed import Placed as Placed
-from ._placed import alike as alike
-from ._placed import along_effects as along_effects
-from ._placed import by_structure as by_structure
 from ._scene import Scene as Scene
 from .cable import CableDrag as CableDrag
 from .counterbalance import Counterbalance as Counterbalance

@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..effects import AbstractEffect, Motion, Placed, alike, along_effects
+from ..effects import AbstractEffect, Motion
+from ..effects.placed import Placed, alike, along_effects
 from .loop import ClosedLoop
 
 
