@@ -13,7 +13,7 @@ import jaxid
 from jaxid.discovery.asked import Asked
 from jaxid.discovery.search import Search
 from jaxid.discovery.step import Step
-from jaxid.effects import AbstractEffect, Motion, on_joint
+from jaxid.effects import AbstractEffect, Motion, Scene, on_joint
 from jaxid.parameters import Scalar, parameter
 from jaxid.storage.campaign import Campaign
 
@@ -104,6 +104,28 @@ def search_of(case: sim.Case) -> Search:
         most=6,
     )
     return Search(asked, Campaign(None, {}), silent)
+
+
+def scene_of(speed: float) -> Scene:
+    """Of a joint with this highest speed, rad/s."""
+    one = np.ones(1)
+    return Scene(
+        -one,
+        one,
+        speed * one,
+        one,
+        one,
+        one,
+        one,
+        0.005,
+        10.0,
+        ("a",),
+        ((),),
+        (),
+        0.0,
+        (False,),
+        (None,),
+    )
 
 
 def silent(*_: object, **__: object) -> None:

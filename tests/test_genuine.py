@@ -2,33 +2,10 @@
 
 import dataclasses
 
-import numpy as np
 import pytest
-from stories import search_of
+from stories import scene_of, search_of
 
-from jaxid.effects import Scene, Stribeck, Viscous
-
-
-def scene_of(speed: float) -> Scene:
-    """Of a joint with this highest speed, rad/s."""
-    one = np.ones(1)
-    return Scene(
-        -one,
-        one,
-        speed * one,
-        one,
-        one,
-        one,
-        one,
-        0.005,
-        10.0,
-        ("a",),
-        ((),),
-        (),
-        0.0,
-        (False,),
-        (None,),
-    )
+from jaxid.effects import Stribeck, Viscous
 
 
 @pytest.mark.parametrize(

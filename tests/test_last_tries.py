@@ -6,7 +6,7 @@ import independent as sim
 import numpy as np
 import pytest
 from independent import effects as fx
-from stories import recordings_of, search_of, two_link_of, with_chain
+from stories import recordings_of, scene_of, search_of, two_link_of, with_chain
 
 import jaxid
 from jaxid.discovery.diagnosis import Diagnosis
@@ -47,6 +47,7 @@ def diagnosis_of(*verdicts) -> Diagnosis:
     """One with these verdicts on effects, and on no curve."""
     found = object.__new__(Diagnosis)
     parts = {"forms": verdicts, "ranking": verdicts, "where": (), "significance": 0.01}
+    parts["scene"] = scene_of(3.0)
     for name, value in parts.items():
         object.__setattr__(found, name, value)
     return found
