@@ -88,13 +88,13 @@ class Examined:
     def not_genuine(self, fit: Fit) -> tuple[AbstractEffect, ...]:
         """The added effects of a fit that only approximate another effect; a note names them."""
         effects = fit.loop.effects
-        # All diagnoses describe the same recorded motion; before the first one none is known.
-        scenes = [d.scene for d in self.diagnoses.values()][:1]
+        if not self.diagnoses:
+            # The recorded motion is not known before the first one.
+            return ()
+        # All of them describe the same motion.
+        scene = next(iter(self.diagnoses.values())).scene
         found = tuple(
-            e
-            for scene in scenes
-            for e in self.added(fit)
-            if not e.genuine(scene, [x for x in effects if x is not e])
+            e for e in self.added(fit) if not e.genuine(scene, [x for x in effects if x is not e])
         )
         if found:
             self.note(f"{listed(found)}: the fitted values are those of another effect")

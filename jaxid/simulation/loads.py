@@ -72,16 +72,17 @@ def _required(
     """Torque that effects with their own states require, `(joints,)`."""
     still = dataclasses.replace(motion, a=jnp.zeros_like(motion.a))
 
-    def torque(effect: AbstractEffect, state: Float[Array, " _"], seen=lambda at: at):
-        at = still if effect.inertial and not inertia else motion
-        return effect.torque(dataclasses.replace(seen(at), state=state))
+    def seen(effect: AbstractEffect) -> Motion:
+        return still if effect.inertial and not inertia else motion
 
     total = jnp.zeros_like(motion.v)
     if not grouped:
-        return sum((torque(effect, state) for effect, state in effects), total)
+        for effect, state in effects:
+            total = total + effect.torque(dataclasses.replace(seen(effect), state=state))
+        return total
 
-    def of_placed(one: Placed, state: Float[Array, " _"]):
-        return torque(one.effect, state, one.motion)
+    def of_placed(one: Placed, state: Float[Array, " _"]) -> Float[Array, " own"]:
+        return one.effect.torque(dataclasses.replace(one.motion(seen(one.effect)), state=state))
 
     for group, places in alike([effect for effect, _ in effects], len(motion.v)):
         states = jnp.stack([effects[k][1] for k in places])
