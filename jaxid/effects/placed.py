@@ -50,7 +50,7 @@ class Placed(eqx.Module):
         return cls(dataclasses.replace(effect, **moved), np.asarray(own) - 1, along, joints)
 
     def motion(self, motion: Motion) -> Motion:
-        """A motion of the arm as the effect sees it, with vectors `(own,)` in place of `(joints,)`."""
+        """A motion of the arm as the effect sees it, with vectors of its own joints, `(own,)`."""
         if self.along is not None:
             signals = [getattr(motion, name) for name in _COORDINATES]
             every = jnp.concatenate([motion.t[..., None], *signals], axis=-1)
