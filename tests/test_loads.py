@@ -1,12 +1,15 @@
 """Torque of effects: grouped for all joints of an arm, and one after the other."""
 
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import threadpoolctl
+from independent import effects as fx
 from loops import four_joints
 
 import jaxid
@@ -14,6 +17,7 @@ from jaxid.effects import (
     AbstractEffect,
     Coulomb,
     Counterbalance,
+    GearFriction,
     LoadDependentFriction,
     Motion,
     RotorInertia,
@@ -71,6 +75,49 @@ def test_effects_of_one_structure_are_computed_together():
     for inertia in (True, False):
         one, other = both(True, inertia), both(False, inertia)
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-12), one, other)
+
+
+@pytest.mark.parametrize("behind", [0.0, 0.4, 1.0])
+def test_load_dependent_friction_is_the_same_by_torque_and_by_motion(behind):
+    """The torque that a motion needs gives that motion: friction depends on the whole torque."""
+    loaded = (
+        LoadDependentFriction(joint=1, ratio=0.3, behind=behind),
+        LoadDependentFriction(joint=2, ratio=0.6, behind=behind),
+        GearFriction(joint=3, drive=0.3, back=0.2, slow=0.4, slow_back=0.1, velocity=0.5),
+    )
+    loop = jaxid.serial(four_joints()).with_effects((Coulomb(joint=1, level=0.5), *loaded))
+    plain = loop.with_effects(loop.effects[:1])
+    rng = np.random.default_rng(8)
+    for q, v, a, tau in rng.normal(size=(20, 4, 4)):
+        motion = Motion(*map(jnp.asarray, (0.5, q, v, a, 30 * tau)), jnp.zeros(0), jnp.asarray(0))
+        states = tuple(e.initial_state() for e in loop.effects)
+        drive, _ = effect_loads(loop, motion, states)
+        others, _ = effect_loads(plain, motion, states[:1])
+        assert np.abs(drive - others)[:3].min() > 0
+        left = dataclasses.replace(motion, tau=motion.tau - (drive - others))
+        again, _ = effect_loads(loop, left, states, needed=True)
+        np.testing.assert_allclose(again, drive, rtol=1e-9)
+
+
+@pytest.mark.parametrize("behind", [1.0, 0.0])
+def test_torque_along_a_recorded_motion_has_the_friction_of_its_load(behind):
+    """Hamon's friction by the independent simulator; by the drive's torque in closed form."""
+    t = np.arange(0, 4, 1e-3)
+    q = np.stack([0.3 * np.sin(5 * t)], axis=1)
+    record = jaxid.Recording.from_arrays(t, q, q)
+    friction = LoadDependentFriction(joint=1, ratio=0.3, behind=behind, smoothing=0.01)
+    effects = Viscous(joint=1, coefficient=2.0), friction
+    loop = jaxid.ClosedLoop(jaxid.arms.Axis(M=3.0), jaxid.control.Tracking(cutoff=20.0), effects)
+    (run,) = jaxid.simulate(loop, record)
+    v, a = run.v[:, 0], np.gradient(run.v[:, 0], t)
+    net = run.tau[:, 0] - 2.0 * v
+    if behind:
+        law = fx.LoadDependentFriction(1, 0.3, gamma=100.0)
+        link = np.array([law.delivered(x, w) for x, w in zip(net, v, strict=True)])
+    else:
+        link = net - 0.3 * np.abs(net) * 2 / np.pi * np.arctan(100.0 * v)
+    inner = slice(200, -200)
+    np.testing.assert_allclose(link[inner], 3.0 * a[inner], atol=2e-3 * np.abs(a).max())
 
 
 def test_blas_has_one_thread_only_while_a_function_runs():

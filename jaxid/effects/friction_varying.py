@@ -14,15 +14,24 @@ from .friction import sign_form, smoothing_speed
 
 
 class LoadDependentFriction(AbstractEffect):
-    """Coulomb friction that grows with the transmitted torque: alpha |tau_link| sigma(v).
+    """Coulomb friction that grows with the transmitted torque: alpha |tau_load| sigma(v).
 
-    The torque that reaches the link obeys tau_link = tau - alpha |tau_link| sigma(v), which is
-    solved in closed form (Hamon, Gautier, Garrec 2010).
+    The load is tau_load = tau - kappa alpha |tau_load| sigma(v), which is solved in closed form.
+    With kappa = 1 it is the torque that reaches the link (Hamon, Gautier, Garrec 2010), with
+    kappa = 0 that of the drive. The two differ in how much more friction a joint has that drives
+    its load than one that its load drives, as the efficiencies of a gear do.
+
+    **Arguments:**
+
+    - `ratio`: alpha. `behind`: kappa, held unless freed.
     """
 
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     ratio: Scalar = parameter(0.0, symbol="alpha", unit="1", lower=0.0, upper=0.95, scale=0.1)
+    behind: Scalar = parameter(
+        1.0, symbol="kappa", unit="1", lower=0.0, upper=1.0, scale=0.5, free=False, linear=False
+    )
     smoothing: Scalar = smoothing_speed()
     form: Scalar = sign_form()
     loaded = True
@@ -33,12 +42,12 @@ class LoadDependentFriction(AbstractEffect):
         return [cls(joint=j, **scene.sign(j)) for j in scene.joints]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
-        """alpha |tau_link| sigma(v) on the joint, `(joints,)`."""
+        """alpha |tau_load| sigma(v) on the joint, `(joints,)`."""
         j = self.joint - 1
         share = self.ratio * smooth_sign(motion.v[j], self.smoothing, self.form)
         available = motion.tau[j]
-        link = jnp.abs(available) / (1 + share * jnp.sign(available))
-        return on_joint(self.joint, share * link, motion)
+        load = jnp.abs(available) / (1 + self.behind * share * jnp.sign(available))
+        return on_joint(self.joint, share * load, motion)
 
 
 class PositionDependentFriction(AbstractEffect):

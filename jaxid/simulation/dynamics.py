@@ -256,13 +256,14 @@ def _beside_bodies(
     """Torque that a motion needs in addition to `rigid`, minus external torque."""
     helped, grouped = outside.push + outside.pull, motion.imposed
     if any(effect.loaded for effect in loop.effects):
-        # Load-dependent effects get the torque that the motion needs without them.
+        # Load-dependent effects depend on the torque that the motion needs without them.
         pairs = zip(loop.effects, state.effects, strict=True)
         kept = [(e, s) for e, s in pairs if not e.loaded]
         others = loop.with_effects([e for e, _ in kept])
         drive, link = effect_loads(others, motion, tuple(s for _, s in kept), grouped=grouped)
         motion = dataclasses.replace(motion, tau=rigid - helped + drive + link)
-    drive, link = effect_loads(loop, motion, state.effects, push=outside.push, grouped=grouped)
+    own, push = state.effects, outside.push
+    drive, link = effect_loads(loop, motion, own, push=push, needed=True, grouped=grouped)
     return drive + link - helped
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -20,6 +21,7 @@ def effect_loads(
     push: Float[Array, " joints"] | float = 0.0,
     curves: bool = True,
     inertia: bool = True,
+    needed: bool = False,
     grouped: bool = False,
 ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
     """Torque that effects on the drives and on the links require, `(joints,)` each.
@@ -34,6 +36,8 @@ def effect_loads(
     - `push`: external torque on the drives, which load-dependent effects include.
     - `curves`: False to leave out effects that need an acceleration which is not known yet.
     - `inertia`: False to leave out terms proportional to acceleration.
+    - `needed`: whether the torque of `motion` is what it needs without load-dependent effects, not
+      that of the drives.
     - `grouped`: whether effects of one structure are computed as one array, for many instants. A
       program with all joints of a large arm then compiles in a fraction of the time.
     """
@@ -54,8 +58,35 @@ def effect_loads(
         ahead = steady + required(_turning, motion, inertia=False)
         load = link_load(loop, behind, states)
         left = dataclasses.replace(motion, tau=motion.tau - ahead + push, load=load)
-        drive = drive + required(lambda e: e.loaded, left)
+
+        def by_load(tau: Float[Array, " joints"]) -> Float[Array, " joints"]:
+            return required(lambda e: e.loaded, dataclasses.replace(left, tau=tau))
+
+        tau = _with_friction(by_load, left.tau) if needed else left.tau
+        drive = drive + by_load(tau)
     return drive, link
+
+
+# Number of Newton steps; friction is linear in torque between one or two kinks.
+_STEPS = 3
+
+
+def _with_friction(
+    by_load: Callable[[Float[Array, " joints"]], Float[Array, " joints"]],
+    link: Float[Array, " joints"],
+) -> Float[Array, " joints"]:
+    """Torque of the drives of which friction leaves the torque that the links need, `(joints,)`.
+
+    **Arguments:**
+
+    - `by_load`: friction by the torque of the drives; that of a joint depends on its own torque.
+    - `link`: torque that the links need.
+    """
+    tau = link
+    for _ in range(_STEPS):
+        friction, slope = jax.jvp(by_load, (tau,), (jnp.ones_like(tau),))
+        tau = tau - (tau - friction - link) / (1 - slope)
+    return tau
 
 
 def _turning(effect: AbstractEffect) -> bool:
