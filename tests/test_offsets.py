@@ -4,6 +4,7 @@ Torque is that of inverse dynamics written out here, along motions in closed for
 """
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,15 @@ from test_release import axis, predictor, recorded
 
 import jaxid
 from jaxid.discovery.fits import Fits
-from jaxid.discovery.models import LIKELY
+from jaxid.discovery.last_tries import without_offset
+from jaxid.discovery.models import LIKELY, Model, Visited
 from jaxid.discovery.offsets import held_offsets, instead_of_offsets
+from jaxid.discovery.predict import Predictor
+from jaxid.discovery.search import Search
+from jaxid.discovery.system import System
 from jaxid.discovery.verify import Refits
+from jaxid.effects import AsymmetricFriction, QuadraticDrag
+from jaxid.noise import ARFilter
 from jaxid.storage.campaign import Campaign
 
 SIZE, EPS = 0.8, 0.003
@@ -76,6 +83,29 @@ def test_a_fit_without_an_offset_is_saved_under_its_own_name(monkeypatch):
     for loop in (axis(EPS), axis(EPS).hold(offset1=0.0)):
         fits.exchanged(loop, (), (), ())
     assert names[1] == f"{names[0]}, offset1 held"
+
+
+def test_the_friction_is_tried_beside_the_effects_that_were_added(monkeypatch):
+    runs = [biased(1, True), biased(2, True)]
+    drag = QuadraticDrag(joint=1)
+    fit = jaxid.fit(axis(EPS).add(drag), runs, jaxid.OEM(progress=False))
+    seen = Predictor.of(System.of(fit), [ARFilter(np.zeros(0), 0.01)])
+    tried = []
+    monkeypatch.setattr(Refits, "unfiltered", lambda self, loop, noise: fit)
+    monkeypatch.setattr(Refits, "filtered", lambda self, loop, noise: tried.append(loop) or fit)
+    at = Model((fit.loop.effects[-1],), 0.0, fit=fit)
+    search = object.__new__(Search)
+    search.seen, search.offsets, search.small = (fit, seen), {}, set()
+    search.visited = Visited()
+    search.asked = SimpleNamespace(catalogue=(AsymmetricFriction,), most=6)
+    search.fits = Fits(Refits(jaxid.Recordings.of(runs), jaxid.OEM()), Campaign(None, {}))
+    search.watched = SimpleNamespace(begin=lambda *_: None)
+    search.not_genuine = lambda fit: ()
+    search.added = lambda fit: fit.loop.effects[-1:]
+    search.visit = lambda effects, fit: Model(effects, 10.0, fit=fit)
+    assert without_offset(search, at) is None
+    names = [e.effect_name() for e in tried[0].effects]
+    assert names == ["viscous", "coulomb", "torque_offset", "quadratic_drag", "asymmetric_friction"]
 
 
 def searched(smooth: bool, noise: float = 0.1, **settings) -> jaxid.Discovery:

@@ -1,7 +1,6 @@
 """Best-first search over sets of effects, each predicted in the linear system."""
 
 import dataclasses
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 
 import equinox as eqx
@@ -12,7 +11,7 @@ from ..effects import AbstractEffect, Curve
 from ..noise import ARFilter
 from ..simulation.loop import ClosedLoop
 from .bounded import least_squares
-from .landscape import Entry, Landscape, form, shares_a_joint
+from .landscape import Entry, Landscape, crowded, form, shares_a_joint
 from .likelihood import score
 from .predict import Prediction
 from .score import spanned
@@ -106,6 +105,17 @@ def explore(
     return sorted(refined, key=lambda c: c.score)
 
 
+def largest_first(c: Candidate, examined: Sequence[Candidate]) -> Candidate:
+    """The set with its effects in the order of what each explains alone.
+
+    A result lists effects that are added together in this order. Effects that were not examined
+    alone are last.
+    """
+    alone = {one.key[0]: one.score for one in examined if one.size == 1}
+    ordered = sorted(c.effects, key=lambda e: alone.get(form(e), np.inf))
+    return dataclasses.replace(c, effects=tuple(ordered))
+
+
 def _ranked(seen: dict[tuple, Candidate]) -> list[Candidate]:
     return sorted(seen.values(), key=lambda c: c.score)
 
@@ -177,16 +187,16 @@ def _moves(
     most: int,
 ) -> Iterator[tuple[AbstractEffect, ...]]:
     own = _fitted(landscape.predictor.system.loop)
-    had = Counter(form(e)[:2] for e in (*own, *at.effects))
+    had = (*own, *at.effects)
     if len(at.effects) < most:
-        entries = _plain(landscape.beside(at.prediction), had)
+        entries = _allowed(landscape.beside(at.prediction), had)
         best = entries[0].evidence if entries else 0.0
         for entry in entries[:_ADDED]:
             if entry.evidence > max(0.0, _BEHIND * best):
                 yield (*at.effects, entry.effect)
         if len(at.effects) + 1 < most:
             pairs = landscape.pairs(at.prediction, entries[:_FIRSTS])
-            pairs = [pair for pair in pairs if _plain(pair, had) == list(pair)]
+            pairs = [(a, b) for a, b in pairs if _allowed([b], (*had, a.effect))]
             for one, other in pairs[:_PAIRED]:
                 if one.evidence + other.evidence > max(best, 0.0) + DECISIVE:
                     yield (*at.effects, one.effect, other.effect)
@@ -200,7 +210,7 @@ def _moves(
             continue
         others = [
             e
-            for e in _plain(landscape.beside(without.prediction), had)
+            for e in _allowed(landscape.beside(without.prediction), (*own, *less))
             if form(e.effect)[:2] != form(gone)[:2]
         ]
         for entry in others[:_PAIRED]:
@@ -217,17 +227,9 @@ def _fitted(loop: ClosedLoop) -> list[AbstractEffect]:
     return [e for k, e in enumerate(loop.effects) if k in places]
 
 
-def _plain(entries: Sequence[Entry], had: Counter) -> list[Entry]:
-    """Entries of the catalogue of which the joint may have one more.
-
-    A joint may have two effects of some kinds, such as end stops at both ends of the travel or two
-    harmonics of a ripple, and one of the others. More of them only approximate another effect.
-    """
-    return [
-        e
-        for e in entries
-        if not isinstance(e.effect, Curve) and had[form(e.effect)[:2]] < 1 + e.effect.several
-    ]
+def _allowed(entries: Sequence[Entry], had: Sequence[AbstractEffect]) -> list[Entry]:
+    """Entries of the catalogue that can be added to these effects; curves are no entries of it."""
+    return [e for e in entries if not isinstance(e.effect, Curve) and not crowded((e.effect,), had)]
 
 
 def _with_curves(landscape: Landscape, at: Candidate) -> list[Candidate]:

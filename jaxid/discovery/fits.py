@@ -128,6 +128,7 @@ class Fits:
         - `had`: effects of the loop over the starting model. `effects`: those in their place.
         """
         kept = [e for e in loop.effects if not any(e is x for x in had)]
+        assert len(kept) == len(loop.effects) - len(had)
         start, refits = loop.with_effects((*kept, *effects)), self._refits
         new = not all(any(e is x for x in had) for e in effects)
 

@@ -1,5 +1,6 @@
 """All hypotheses compared with the residual of a set of effects in the linear system."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -155,6 +156,20 @@ def shares_a_joint(effects: Sequence[AbstractEffect]) -> bool:
     """Whether two transmissions are on one joint, which can have only one."""
     joints = [e.joint for e in effects if isinstance(e, AbstractTransmission)]
     return len(joints) != len(set(joints))
+
+
+def crowded(effects: Sequence[AbstractEffect], own: Sequence[AbstractEffect]) -> bool:
+    """Whether a joint would have more of a kind of effect than it can have.
+
+    A joint may have two effects of some kinds, such as end stops at both ends of the travel or two
+    harmonics of a ripple, and one of the others. More of them only approximate another effect.
+
+    **Arguments:**
+
+    - `effects`: additional effects. `own`: those that the model has.
+    """
+    counts = Counter(form(e)[:2] for e in (*own, *effects))
+    return any(counts[form(e)[:2]] > 1 + e.several for e in effects)
 
 
 def _sized(effect: AbstractEffect, amplitude: Float[np.ndarray, " columns"]) -> AbstractEffect:

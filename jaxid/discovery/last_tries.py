@@ -110,7 +110,8 @@ def without_offset(search: Examined, at: Model) -> Model | None:
         if found.loss > DECISIVE:
             continue
         search.offsets[found.name] = found.effect
-        effects = (*at.effects, found.effect)
+        # The predicted loop has copies of the fitted effects.
+        effects = found.loop.effects[-len(at.effects) - 1 :]
         if not (search.visited.fitted(effects) or search.small.intersection(key_of(effects))):
             again = partial(search.fits.exchanged, found.loop, effects, effects, found.noise)
             best = _better(search, best, (found.effect,), again)
