@@ -14,6 +14,8 @@ Count = tuple[int, int]
 NAMELESS = ("rigid", "Gaussian process", "network")
 # Bounds of the probabilities of added effects.
 CLAIMS = (0.0, 0.5, 0.7, 0.9, 0.99, 1.0)
+# Smallest probability of an effect that the models of an answer share.
+_LIKELY = 0.05
 WORLDS = ("friction", "noise", "robot", "law")
 
 
@@ -92,7 +94,11 @@ def _verdicts(lines: Sequence[Line]) -> dict[str, str]:
         if any(key in _true(x) for key in _group(added))
     ]
     undetermined = sum(x["marks"]["verdict"] == "undetermined" for x in done)
+    likely = [found for x in effects for found in _named_or_likely(x)]
     return {
+        f"effects named, or with a probability above {_LIKELY:g}": share(
+            (sum(likely), len(likely))
+        ),
         "an addition wrong, of probability above 0.9": share((wrong, len(effects))),
         "undetermined": share((undetermined, len(done))),
         "called adequate or explained above 1.3 of the floor": share(
@@ -103,6 +109,14 @@ def _verdicts(lines: Sequence[Line]) -> dict[str, str]:
             f"{np.median(sizes):.0f}, {max(sizes)}" if sizes else "–"
         ),
     }
+
+
+def _named_or_likely(line: Line) -> list[bool]:
+    """Whether each hidden effect is named, or part of models with a share of the weight."""
+    rivals = line["story"].get("probabilities", ())
+    likely = {(e["effect"], e["joint"]) for e in rivals if e["probability"] > _LIKELY}
+    named = zip(_true(line), line["marks"]["named"], strict=True)
+    return [was_named or key in likely for key, was_named in named]
 
 
 def _true(line: Line) -> list[tuple[str, int]]:

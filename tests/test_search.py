@@ -1,7 +1,6 @@
 """The search of a discovery: which sets it makes, which of them it keeps."""
 
 import dataclasses
-from collections import Counter
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -16,12 +15,13 @@ from stories import recordings_of, search_of, two_link_of, with_chain
 import jaxid
 from jaxid.discovery.bounded import bounded_amplitudes
 from jaxid.discovery.diagnosis import over_recordings
-from jaxid.discovery.explore import Candidate, _fitted, _plain, key_of
+from jaxid.discovery.explore import Candidate, _allowed, _fitted, key_of, largest_first
 from jaxid.discovery.hypotheses import Hypothesis
-from jaxid.discovery.landscape import Entry, shares_a_joint
+from jaxid.discovery.landscape import Entry, crowded, shares_a_joint
 from jaxid.discovery.likelihood import price, score, weights
 from jaxid.discovery.loose import undetermined, with_fewer, without_loose
 from jaxid.discovery.models import Model, Visited, probability
+from jaxid.discovery.predict import Prediction
 from jaxid.discovery.score import Data
 from jaxid.discovery.search import Search, _lost
 from jaxid.discovery.signs import of_one_sign
@@ -135,11 +135,16 @@ def test_weights_are_odds():
 
 
 def test_effect_is_added_twice_at_the_most():
-    ripple = TorqueRipple(joint=1, harmonic=2.0)
+    ripple, spring = TorqueRipple(joint=1, harmonic=2.0), Spring(joint=1)
     entry = Entry(Hypothesis(ripple, (0, 1), (-np.inf,) * 2, (np.inf,) * 2), 100.0, ripple)
-    name = "torque_ripple", 1
-    assert _plain([entry], Counter({name: 1})) == [entry]
-    assert _plain([entry], Counter({name: 2})) == []
+    assert _allowed([entry], [ripple, spring]) == [entry]
+    assert _allowed([entry], [ripple, spring, ripple]) == []
+    # Two at once, beside one that the model has.
+    assert crowded([ripple, ripple], [ripple])
+    assert not crowded([ripple, ripple], [spring, dataclasses.replace(ripple, joint=2)])
+    assert crowded([spring, spring], [])
+    # What a user has declared does not exclude other effects.
+    assert not crowded([spring], [ripple] * 3)
 
 
 def test_what_is_held_may_be_added_to():
@@ -160,6 +165,40 @@ def test_sets_are_the_same_in_any_order_and_at_any_values():
     assert key_of([one, other]) == key_of([Spring(joint=2), TorqueOffset(joint=1)])
     assert key_of([one]) != key_of([TorqueOffset(joint=2)])
     assert key_of([one, one]) != key_of([one])
+
+
+def test_effects_that_are_added_together_are_listed_by_what_they_explain():
+    ripple, spring = TorqueRipple(joint=1, harmonic=4.0), Spring(joint=2)
+
+    def of(effects, value):
+        rest, unused = np.zeros((1, 1, 1)), object.__new__(Prediction)
+        return Candidate(tuple(effects), value, (), unused, rest, np.zeros(0))
+
+    both = of([ripple, spring], -90.0)
+    examined = [both, of([spring], -60.0), of([ripple], -20.0), of([], 0.0)]
+    assert largest_first(both, examined).effects == (spring, ripple)
+    assert largest_first(both, examined[:3:2]).effects == (ripple, spring)
+    assert largest_first(both, examined).key == both.key
+
+
+@pytest.mark.xdist_group("offset")
+def test_a_fit_that_strays_is_repeated_without_filters_once(offset_story, monkeypatch):
+    """Its repetition is the start of the next fit with filters, and not made again."""
+    step = offset_story[0].steps[0]
+    noise = step.diagnosis.noise
+    refits = Refits(step.fit.recordings, jaxid.OEM(progress=False))
+    plain = jaxid.fit(
+        step.fit.loop,
+        step.fit.recordings,
+        SeparablePEM(
+            refits.given(), filters=tuple(ARFilter(np.zeros(0), f.variance) for f in noise)
+        ),
+    )
+    asked = []
+    monkeypatch.setattr(Refits, "filtered", lambda self, loop, noise: asked.append(loop) or plain)
+    monkeypatch.setattr(Refits, "unfiltered", lambda *_: pytest.fail("the same fit again"))
+    assert refits.with_effects(step.fit, (), noise, promised=100.0) is plain
+    assert len(asked) == 2
 
 
 def test_what_shares_the_weight_is_alike(offset_story):

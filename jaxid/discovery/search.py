@@ -15,7 +15,7 @@ from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from .diagnosis import Diagnosis, over_recordings, share_left
 from .examined import Examined
-from .explore import DECISIVE, Candidate, explore, key_of
+from .explore import DECISIVE, Candidate, explore, key_of, largest_first
 from .landscape import Landscape, forms_of
 from .last_tries import replaced, with_transmission, without_offset
 from .likelihood import price
@@ -247,7 +247,7 @@ class Search(Examined):
             key = Counter(c.key)
             # A set that contains a better one is left out: the smaller one is fitted first.
             if not any(x < key for x in seen) and self._supported(c):
-                model = self._fitted(at, c, nothing - c.score)
+                model = self._fitted(at, largest_first(c, plain), nothing - c.score)
                 if model is None or _lost(model, at):
                     failed += 1
                     continue

@@ -153,7 +153,9 @@ class Refits(eqx.Module):
         best = self.best([self.filtered(start, noise) for start in starts])
         gained = score_of(before).value - score_of(best).value
         if not tried and not promised / _FAR < gained < promised * _FAR:
-            best = self.best([best, self.filtered(self.unfiltered(loop, noise).loop, noise)])
+            # A fit that strays has been repeated without filters already.
+            plain = best if _is_plain(best) else self.unfiltered(loop, noise)
+            best = self.best([best, self.filtered(plain.loop, noise)])
         for order in (effects, effects[::-1]) if len(effects) > 1 else ():
             if score_of(before).value - score_of(best).value < promised / _FAR:
                 best = self.best([best, self.filtered(self.in_turn(before, order, noise), noise)])
@@ -189,6 +191,11 @@ class Refits(eqx.Module):
     def best(self, found: Sequence[Fit]) -> Fit:
         """The fit with the lowest score, of several fits of one set of effects."""
         return min(found, key=lambda f: score_of(f).value)
+
+
+def _is_plain(found: Fit) -> bool:
+    """Whether a fit assumes white noise."""
+    return isinstance(found.noise, tuple) and all(f.order == 0 for f in found.noise)
 
 
 def _promising(before: Fit, tried: Sequence[Fit]) -> list[Fit]:
