@@ -15,22 +15,17 @@ from stories import recordings_of, search_of, two_link_of, with_chain
 import jaxid
 from jaxid.discovery.bounded import bounded_amplitudes
 from jaxid.discovery.diagnosis import over_recordings
-from jaxid.discovery.explore import Candidate, _allowed, _fitted, key_of, largest_first
-from jaxid.discovery.hypotheses import Hypothesis
-from jaxid.discovery.landscape import Entry, crowded, shares_a_joint
+from jaxid.discovery.explore import Candidate
 from jaxid.discovery.likelihood import price, score, weights
 from jaxid.discovery.loose import undetermined, with_fewer, without_loose
 from jaxid.discovery.models import Model, Visited, probability
-from jaxid.discovery.predict import Prediction
 from jaxid.discovery.score import Data
 from jaxid.discovery.search import Search, _lost
 from jaxid.discovery.signs import of_one_sign
 from jaxid.discovery.verify import Refits
 from jaxid.effects import (
     AbstractEffect,
-    Backlash,
     EncoderEccentricity,
-    JointElasticity,
     Motion,
     QuadraticDrag,
     RotorInertia,
@@ -132,53 +127,6 @@ def test_weights_are_odds():
 
 
 # --- sets of effects ------------------------------------------------------------------------------
-
-
-def test_effect_is_added_twice_at_the_most():
-    ripple, spring = TorqueRipple(joint=1, harmonic=2.0), Spring(joint=1)
-    entry = Entry(Hypothesis(ripple, (0, 1), (-np.inf,) * 2, (np.inf,) * 2), 100.0, ripple)
-    assert _allowed([entry], [ripple, spring]) == [entry]
-    assert _allowed([entry], [ripple, spring, ripple]) == []
-    # Two at once, beside one that the model has.
-    assert crowded([ripple, ripple], [ripple])
-    assert not crowded([ripple, ripple], [spring, dataclasses.replace(ripple, joint=2)])
-    assert crowded([spring, spring], [])
-    # What a user has declared does not exclude other effects.
-    assert not crowded([spring], [ripple] * 3)
-
-
-def test_what_is_held_may_be_added_to():
-    """A rotor of a data sheet may be wrong, so another may be found on its joint."""
-    loop = jaxid.scara().add(RotorInertia(joint=2, inertia=0.1))
-    assert any(isinstance(e, RotorInertia) for e in _fitted(loop))
-    assert not any(isinstance(e, RotorInertia) for e in _fitted(loop.hold("Ia2")))
-
-
-def test_a_joint_has_one_transmission():
-    gap, shaft = Backlash(joint=1, gap=0.01), JointElasticity(joint=1, compliance=0.01)
-    assert shares_a_joint([gap, TorqueOffset(joint=1), shaft])
-    assert not shares_a_joint([gap, dataclasses.replace(shaft, joint=2)])
-
-
-def test_sets_are_the_same_in_any_order_and_at_any_values():
-    one, other = TorqueOffset(joint=1, level=0.1), Spring(joint=2, stiffness=3.0)
-    assert key_of([one, other]) == key_of([Spring(joint=2), TorqueOffset(joint=1)])
-    assert key_of([one]) != key_of([TorqueOffset(joint=2)])
-    assert key_of([one, one]) != key_of([one])
-
-
-def test_effects_that_are_added_together_are_listed_by_what_they_explain():
-    ripple, spring = TorqueRipple(joint=1, harmonic=4.0), Spring(joint=2)
-
-    def of(effects, value):
-        rest, unused = np.zeros((1, 1, 1)), object.__new__(Prediction)
-        return Candidate(tuple(effects), value, (), unused, rest, np.zeros(0))
-
-    both = of([ripple, spring], -90.0)
-    examined = [both, of([spring], -60.0), of([ripple], -20.0), of([], 0.0)]
-    assert largest_first(both, examined).effects == (spring, ripple)
-    assert largest_first(both, examined[:3:2]).effects == (ripple, spring)
-    assert largest_first(both, examined).key == both.key
 
 
 @pytest.mark.xdist_group("offset")
@@ -473,15 +421,15 @@ def test_sets_with_unsupported_effects_do_not_hide_a_supported_one(monkeypatch):
     ]
     monkeypatch.setattr("jaxid.discovery.search._lost", lambda model, at: model.score > at.score)
     fitted = Model((), 0.0)
-    search._fitted = lambda at, c, promised: fitted
+    search._fitted = lambda at, c, *_: fitted
     # A superset of a better one is left out, and so is what is far behind.
     assert search._best_fitted(fitted, sets, 0.0) == [(fitted, sets[2]), (fitted, sets[4])]
     assert search._best_fitted(fitted, sets[:2], 0.0) == []
     # A set that cannot be fitted does not hide others.
-    search._fitted = lambda at, c, promised: None if c is sets[2] else fitted
+    search._fitted = lambda at, c, *_: None if c is sets[2] else fitted
     assert search._best_fitted(fitted, sets, 0.0) == [(fitted, sets[3]), (fitted, sets[4])]
     worse = Model((), 1.0)
-    search._fitted = lambda at, c, promised: worse if c is sets[2] else fitted
+    search._fitted = lambda at, c, *_: worse if c is sets[2] else fitted
     assert search._best_fitted(fitted, sets, 0.0) == [(fitted, sets[3]), (fitted, sets[4])]
 
 

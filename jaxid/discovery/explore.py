@@ -105,15 +105,15 @@ def explore(
     return sorted(refined, key=lambda c: c.score)
 
 
-def largest_first(c: Candidate, examined: Sequence[Candidate]) -> Candidate:
-    """The set with its effects in the order of what each explains alone.
+def largest_first(
+    effects: Sequence[AbstractEffect], examined: Sequence[Candidate]
+) -> tuple[AbstractEffect, ...]:
+    """The effects in the order of what each explains alone; those not examined alone are last.
 
-    A result lists effects that are added together in this order. Effects that were not examined
-    alone are last.
+    A result lists effects that are added together in this order.
     """
     alone = {one.key[0]: one.score for one in examined if one.size == 1}
-    ordered = sorted(c.effects, key=lambda e: alone.get(form(e), np.inf))
-    return dataclasses.replace(c, effects=tuple(ordered))
+    return tuple(sorted(effects, key=lambda e: alone.get(form(e), np.inf)))
 
 
 def _ranked(seen: dict[tuple, Candidate]) -> list[Candidate]:

@@ -247,7 +247,7 @@ class Search(Examined):
             key = Counter(c.key)
             # A set that contains a better one is left out: the smaller one is fitted first.
             if not any(x < key for x in seen) and self._supported(c):
-                model = self._fitted(at, largest_first(c, plain), nothing - c.score)
+                model = self._fitted(at, c, plain, nothing - c.score)
                 if model is None or _lost(model, at):
                     failed += 1
                     continue
@@ -268,23 +268,26 @@ class Search(Examined):
             )
         return not lacking
 
-    def _fitted(self, at: Model, asked: Candidate, promised: float) -> Model | None:
+    def _fitted(
+        self, at: Model, asked: Candidate, examined: Sequence[Candidate], promised: float
+    ) -> Model | None:
         """A full refit with those additional effects that it determines; None if it fails."""
         assert at.fit is not None
-        if (had := self.had(at, (*at.effects, *asked.effects))) is not None:
+        more = largest_first(asked.effects, examined)
+        if (had := self.had(at, (*at.effects, *more))) is not None:
             return had
-        self.watched.begin("fit", f"fit with {listed(asked.effects)}", ROUND)
+        self.watched.begin("fit", f"fit with {listed(more)}", ROUND)
         try:
-            fit = self.fits.with_effects(at.fit, at.effects, asked.effects, asked.noise, promised)
+            fit = self.fits.with_effects(at.fit, at.effects, more, asked.noise, promised)
         except (ModelError, FitError) as error:
             # The candidate cannot be simulated at the predicted values.
-            self.note(f"no fit with {listed(asked.effects)}: {error}")
+            self.note(f"no fit with {listed(more)}: {error}")
             return None
         if not fit.status.simulated:
             return None
-        loose = undetermined(fit, len(asked.effects))
+        loose = undetermined(fit, len(more))
         if loose:
-            self.note(f"{listed(asked.effects)}: the fit determines no value of {listed(loose)}")
+            self.note(f"{listed(more)}: the fit determines no value of {listed(loose)}")
         else:
             loose = self.not_genuine(fit)
         if not loose:
