@@ -204,7 +204,9 @@ def _answer(right: bool, probability: float | None = None) -> dict[str, Any]:
     added = {"effect": "spring" if right else "end_stop", "joint": 1, "probability": probability}
     marks = {"right": right, "first": right, "named": [right], "extra": int(not right)}
     verdict = {"ratio": 1.1, "sure": True, "verdict": "explained", "wrong_and_sure": int(not right)}
-    story = {"added": [{**added, "indistinguishable": []}], "cpu": 2.0}
+    # The wrong answers share the weight with the right one.
+    likely = [{"effect": "spring", "joint": 1, "probability": 0.3}]
+    story = {"added": [{**added, "indistinguishable": []}], "cpu": 2.0, "probabilities": likely}
     return {"story": story, "marks": {**marks, **verdict}}
 
 
@@ -228,6 +230,7 @@ def test_evidence_counts_what_result_files_say():
     made = evidence.sections(lines)
     # Two of jaxid's three effects are not named: one is wrong, one ended in an error.
     assert "| one effect: named | 1 of 3 (6 to 79 %) |" in made["worlds"]
+    assert "probability above 0.05 | 2 of 2 (34 to 100 %) |" in made["worlds"]
     assert "| errors | 1 |" in made["worlds"]
     assert "4 cases; seed 9; date 2026-01-02; commit abc." in made["worlds"]
     # The fourth case was not given to stepwise: it is in no comparison.
