@@ -23,7 +23,7 @@ class LoadDependentFriction(AbstractEffect):
 
     **Arguments:**
 
-    - `ratio`: alpha. `behind`: kappa, held unless freed.
+    - `ratio`: alpha, 1. `behind`: kappa, from 0 to 1, held unless freed.
     """
 
     joint_fields = ("joint",)

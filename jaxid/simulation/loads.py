@@ -11,6 +11,9 @@ from ..effects import AbstractEffect, Motion
 from ..effects.placed import Placed, alike, along_effects
 from .loop import ClosedLoop
 
+# Number of Newton steps for friction by load, which is linear in torque between its few kinks.
+_STEPS = 3
+
 
 def effect_loads(
     loop: ClosedLoop,
@@ -67,10 +70,6 @@ def effect_loads(
     return drive, link
 
 
-# Number of Newton steps; friction is linear in torque between one or two kinks.
-_STEPS = 3
-
-
 def _with_friction(
     by_load: Callable[[Float[Array, " joints"]], Float[Array, " joints"]],
     link: Float[Array, " joints"],
@@ -79,8 +78,9 @@ def _with_friction(
 
     **Arguments:**
 
-    - `by_load`: friction by the torque of the drives; that of a joint depends on its own torque.
-    - `link`: torque that the links need.
+    - `by_load`: friction by the torque of the drives, `(joints,)`, N·m or N. That of a joint
+      depends on its own torque.
+    - `link`: torque that the links need, `(joints,)`, N·m or N.
     """
     tau = link
     for _ in range(_STEPS):
