@@ -190,16 +190,24 @@ def _hidden(rng, wanted, robot, frictions, speed, duration, clean, level) -> tup
 def _recorded(
     rng: np.random.Generator, run: Signals, rate: int, level: np.ndarray, noise: str
 ) -> dict[str, np.ndarray]:
-    """The logged run: at `rate`, with noise in the torque."""
+    """The logged run: at `rate`, with noise in the torque.
+
+    `folded` is the part of the logged torque, without noise, that is due to frequencies too high
+    for `rate`: a law on encoder steps has a broad spectrum, which a logger without a filter folds
+    into all frequencies.
+    """
     every = 1000 // rate
     tau = run.tau[::every]
     errors = _noise(rng, tau.shape, noise) * level
+    sections = signal.butter(8, 0.4 * rate, fs=1000, output="sos")
+    resolved = signal.sosfiltfilt(sections, run.tau, axis=0)[::every]
     return {
         "time": run.time[::every],
         "q": run.q[::every],
         "tau": tau + errors,
         "q_ref": run.q_ref[::every],
         "noise": errors,
+        "folded": tau - resolved,
     }
 
 
@@ -215,6 +223,15 @@ def _noise(rng: np.random.Generator, shape: tuple[int, ...], kind: str) -> np.nd
         loud = np.repeat(rng.random((shape[0] // 50 + 1, 1)) < 0.1, 50, axis=0)[: shape[0]]
         return white * np.where(loud, 2.5, 0.65)
     return white
+
+
+def unexplained(signals: dict[str, np.ndarray], law: str) -> np.ndarray:
+    """The part of a recorded torque that no model explains, `(samples, joints)`, N·m or N.
+
+    Without the law, a model has the torque along the recorded motion, and not what the logger
+    folds into its frequencies. A simulation of the law has both.
+    """
+    return signals["noise"] + (signals["folded"] if law == "unknown" else 0.0)
 
 
 def start_model(case: Case, law: str) -> jaxid.ClosedLoop:

@@ -30,7 +30,7 @@ from jaxid.storage.campaign import Campaign, Failed
 from ._baseline_rows import Motion, Table, residual, table_of
 from ._baseline_tools import TOOLS, Found
 from ._evidence_tables import by_tool
-from ._world_cases import Case, Wanted, draw_wanted, make, read_case, start_model
+from ._world_cases import Case, Wanted, draw_wanted, make, read_case, start_model, unexplained
 from ._world_physics import ROBOTS
 from ._world_results import append, origin
 from .hidden_effects import configure_jax, floor_percent
@@ -48,7 +48,7 @@ def run_case(wanted: Wanted, seed: int, tools: Sequence[str]) -> dict[str, Any]:
         with tempfile.TemporaryDirectory() as folder:
             fitting, held_out = read_case(Path(folder), case)
         loop = start_model(case, LAW)
-        floor = floor_percent(loop, case.recordings["held_out"]["noise"], held_out)
+        floor = floor_percent(loop, unexplained(case.recordings["held_out"], LAW), held_out)
         started = time.process_time()
         table = table_of(case.drawn, fitting)
         prepared = time.process_time() - started
@@ -133,7 +133,7 @@ def visible(case: Case, table: Table) -> list[float]:
             wave = np.zeros_like(motion.q)
             wave[:, effect.joint] = torques[name]
             own = np.concatenate([own, motion.thinned(wave)])
-            noise = np.concatenate([noise, motion.thinned(case.recordings[name]["noise"])])
+            noise = np.concatenate([noise, motion.thinned(unexplained(case.recordings[name], LAW))])
         here = table.joint == effect.joint
         left = residual(table.base, table.rows(own))[here]
         found.append(float(np.linalg.norm(left) / np.linalg.norm(table.rows(noise)[here])))

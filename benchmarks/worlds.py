@@ -28,7 +28,17 @@ import numpy as np
 import jaxid
 from jaxid.storage.campaign import Campaign, Failed
 
-from ._world_cases import KINDS, LAWS, Case, Wanted, draw_wanted, make, read_case, start_model
+from ._world_cases import (
+    KINDS,
+    LAWS,
+    Case,
+    Wanted,
+    draw_wanted,
+    make,
+    read_case,
+    start_model,
+    unexplained,
+)
 from ._world_physics import EFFECTS, FRICTIONS, OUTSIDE, ROBOTS
 from ._world_results import append, line_of, origin
 from .hidden_effects import configure_jax, floor_percent
@@ -57,7 +67,8 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
     found = jaxid.discover(start, fitting, validate=held_out, progress=False)
     took = {"took": time.perf_counter() - started, "cpu": time.process_time() - cpu}
     story = found.to_dict()
-    floor = floor_percent(found.loop, case.recordings["held_out"]["noise"], held_out)
+    noise = unexplained(case.recordings["held_out"], wanted.law)
+    floor = floor_percent(found.loop, noise, held_out)
     return {
         "truth": [
             {"effect": e.name, "joint": e.joint + 1, "size": e.size, **e.drawn} for e in case.hidden
