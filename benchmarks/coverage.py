@@ -44,8 +44,10 @@ def intervals(fit: jaxid.Fit, found: Refitted, kind: str) -> np.ndarray:
         reduced = Reduced(list(residual), list(jacobian), spent)
         flat = jacobian.reshape(-1, p)
         if kind == "sandwich":
-            bread = np.linalg.inv(flat.T @ flat)
-            covariance = bread @ score_covariance(reduced.residuals, reduced.jacobians) @ bread
+            information = flat.T @ flat
+            bread = np.linalg.inv(information)
+            meat = score_covariance(reduced.residuals, reduced.jacobians, information)
+            covariance = bread @ meat @ bread
         else:
             whiten = np.linalg.inv(np.linalg.cholesky(reduced.spread(full)))
             wide = np.einsum("ij,rkjp->rkip", whiten, jacobian).reshape(-1, p)

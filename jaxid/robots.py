@@ -1,12 +1,13 @@
 """Predefined robots: arm, friction, controller and start values from the papers."""
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from .arms import SCARA, Axis, SerialArm, TwoLink
+from .arms import SCARA, Axis, SerialArm, TwoLink, drawn_covariance
 from .arms.urdf import read_urdf
 from .control import PD, AbstractController, Cascade, Tracking
 from .effects import Coulomb, RotorInertia, TorqueOffset, Viscous
@@ -68,6 +69,7 @@ def serial(
     rotors: Sequence[float] | np.ndarray | None = None,
     gears: Any = None,
     bodies: str = "drawn",
+    uncertainty: float = 0.2,
     base: str | None = None,
     tip: str | None = None,
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
@@ -83,13 +85,18 @@ def serial(
     - `gears`: turns of each motor per turn of each joint, `(joints, joints)`, if motors drive more
       than their own joint.
     - `bodies`: `"drawn"` to hold the links' bodies at the values of the file, `"free"` to estimate
-      their base parameters.
+      their base parameters, `"near"` to estimate them as far as the recordings contradict the
+      values of the file.
+    - `uncertainty`: relative standard deviation of masses and inertias in the file, for `"near"`
+      (`jaxid.arms.drawn_covariance`).
     - `base`, `tip`, `gravity`: as for `SerialArm.from_urdf`.
 
     **Raises:** `ModelError` for a file that describes no serial arm.
     """
-    if bodies not in ("drawn", "free"):
-        raise ModelError(f"bodies is {bodies!r}: give 'drawn' or 'free'")
+    if bodies not in ("drawn", "free", "near"):
+        raise ModelError(f"bodies is {bodies!r}: give 'drawn', 'near' or 'free'")
+    if not uncertainty > 0:
+        raise ModelError(f"uncertainty is {uncertainty}: give a positive number, such as 0.2")
     found = read_urdf(source, base, tip)
     arm = SerialArm.of(found, gravity, gears)
     n = arm.joints
@@ -103,9 +110,14 @@ def serial(
     )
     loop = ClosedLoop(arm, controller or Tracking(), effects, name=found.name)
     held = [p.name for p in loop.parameters if p.declaration.symbol == "base"]
-    if bodies == "free":
+    if bodies != "drawn":
         # The inertias of the first rotor and of some others are parts of base parameters.
-        held = [f"Ia{j}" for j, inside in enumerate(arm.absorbed_rotors(), start=1) if inside]
+        inside = [j for j, within in enumerate(arm.absorbed_rotors(), start=1) if within]
+        held = [f"Ia{j}" for j in inside]
+        if bodies == "near":
+            unknown = inside if rotors is None else []
+            known = drawn_covariance(arm, uncertainty, unknown)
+            loop = dataclasses.replace(loop, arm=dataclasses.replace(arm, covariance=known))
     elif rotors is not None:
         held += [f"Ia{j}" for j in range(1, n + 1)]
     # The smoothing of friction near standstill is unknown; it matters most for motions with rests.

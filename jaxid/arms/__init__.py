@@ -10,3 +10,4 @@ from .physical import physical_bodies as physical_bodies
 from .scara import SCARA as SCARA
 from .serial import SerialArm as SerialArm
 from .two_link import TwoLink as TwoLink
+from .uncertain import drawn_covariance as drawn_covariance

@@ -99,6 +99,12 @@ class AbstractArm(eqx.Module):
         first, zeroth = jax.jacfwd(momentum)(values), jax.jacfwd(rest)(values)
         return Split(jnp.zeros_like(first), first, zeroth)
 
+    def expected(
+        self,
+    ) -> tuple[Float[Array, " parameters"], Float[Array, "parameters parameters"]] | None:
+        """Its parameters before any recording, and their covariance; None if nothing is known."""
+        return None
+
     def prismatic(self) -> tuple[bool, ...]:
         """Whether each joint slides (prismatic); otherwise it turns."""
         return (False,) * self.joints

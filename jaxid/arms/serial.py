@@ -35,6 +35,8 @@ class SerialArm(AbstractArm):
       names; those of `bodies` by default.
     - `leading`, `base_names`, `combined`: results of `base_parameters`, which is called if they
       are left out.
+    - `covariance`: of the base parameters of `bodies` before any recording, `(base, base)`, in
+      products of their units; None if nothing is known. `drawn_covariance` computes it.
     """
 
     constants = ("chain", "bodies", "combined")
@@ -47,6 +49,7 @@ class SerialArm(AbstractArm):
     leading: tuple[int, ...] = eqx.field(static=True, default=())
     base_names: tuple[str, ...] = eqx.field(static=True, default=())
     combined: Float[Array, "base parameters"] = eqx.field(converter=as_float64, default=None)
+    covariance: Float[Array, "base base"] | None = eqx.field(converter=as_float64, default=None)
 
     def __post_init__(self):
         if not self.leading:
@@ -165,17 +168,29 @@ class SerialArm(AbstractArm):
         """Derivatives of `inverse` by position and velocity, a row for each torque, SI units."""
         return self.chain.inverse_slopes(self.inertias(), q, v, a)
 
+    def expected(self) -> tuple[Float[Array, " base"], Float[Array, "base base"]] | None:
+        """The base parameters of the drawn bodies, and their covariance if it is given."""
+        if self.covariance is None:
+            return None
+        return self.combined @ self.bodies.reshape(-1), self.covariance
+
     def absorbed_rotors(self) -> tuple[bool, ...]:
         """Whether each joint's rotor inertia is part of a base parameter, `(joints,)`."""
+        return tuple(not np.isnan(column).any() for column in self.rotors_in_base().T)
+
+    def rotors_in_base(self) -> Float[np.ndarray, "base joints"]:
+        """Change of the base parameters by a unit of each rotor's inertia; NaN if none has it."""
         rows, a = _regressor(_geometry(self.chain), self.chain.slides, self.lower, self.upper)
-        basis = np.linalg.qr(rows[:, np.asarray(self.leading)])[0]
-        found = []
+        basis, triangle = np.linalg.qr(rows[:, np.asarray(self.leading)])
+        found = np.full((basis.shape[1], self.joints), np.nan)
         for j in range(self.joints):
             column = np.zeros((len(a), self.joints))
             column[:, j] = a[:, j]
-            flat = column.ravel() / np.linalg.norm(column)
-            found.append(bool(np.linalg.norm(flat - basis @ (basis.T @ flat)) < 1e-7))
-        return tuple(found)
+            flat = column.ravel()
+            within = basis.T @ flat
+            if np.linalg.norm(flat - basis @ within) < 1e-7 * np.linalg.norm(flat):
+                found[:, j] = np.linalg.solve(triangle, within)
+        return found
 
     def planar(self) -> bool:
         """False: the links move in space."""

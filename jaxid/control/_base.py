@@ -125,6 +125,17 @@ class AbstractController(eqx.Module):
         """
         return None
 
+    def likely(self, period: float) -> dict[str, float]:
+        """Standard deviations of its values around zero before any recording, by field.
+
+        Values that are not named may have any size; none is named by default.
+
+        **Arguments:**
+
+        - `period`: time between recorded samples, s.
+        """
+        return {}
+
     def settled(self, recordings: Iterable[Recording]) -> "AbstractController":
         """The controller with settings taken from the fitted recordings, for use on others."""
         return self

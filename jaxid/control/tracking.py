@@ -69,6 +69,10 @@ class Tracking(AbstractController):
         rate = 2 * self.damping * w * (reference.v - reading.v)
         return mass @ (reference.a + rate + w**2 * (reference.q - reading.q)) + reference.tau
 
+    def likely(self, period: float) -> dict[str, float]:
+        """A period for the delay: a logger rarely takes torque and position further apart."""
+        return {"delay": period}
+
     def comparable(self, recording: Recording) -> float:
         """Cutoff of the low-pass, Hz."""
         return float(self.cutoff or signal_cutoff(recording))

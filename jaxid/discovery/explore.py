@@ -145,7 +145,8 @@ def _candidate(landscape: Landscape, found: Prediction) -> Candidate:
 
 def _scored(landscape: Landscape, c: Candidate, rest: np.ndarray) -> Candidate:
     """A set with a new residual, and the score of this residual."""
-    judged = score(landscape.predictor.data, rest, c.freedom, c.size, landscape.forms)
+    data = landscape.predictor.data
+    judged = score(data, rest, c.freedom, c.size, landscape.forms, c.taken)
     return dataclasses.replace(c, score=judged.value, noise=judged.noise, rest=rest)
 
 
@@ -169,8 +170,8 @@ def _estimated(landscape: Landscape, c: Candidate, noise: Sequence[ARFilter]) ->
     data = landscape.predictor.data
     wide = [data.base, c.prediction.moved, *([] if c.columns is None else [c.columns])]
     columns = np.concatenate(wide, axis=-1)
-    white = data.white(columns, noise).reshape(-1, columns.shape[-1])
-    left = data.white(c.rest, noise).reshape(-1)
+    white = data.white_columns(columns, noise, slice(None))
+    left = data.white_residual(c.rest, noise, c.taken)
     basis = spanned(white)
     low, high = landscape.predictor.limits
     within = low - c.taken, high - c.taken

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..estimate import Fit
+from ..estimate.prior import prior_of
 from ..noise import ARFilter
 from .score import Data
 from .separate import filter_of
@@ -17,11 +18,12 @@ _HIGHEST = 30
 
 
 class Score(eqx.Module):
-    """The score S = -2 log L + k log n + 2 log C(P, s), and the noise filters that belong to it.
+    """The score S = -2 log L + r'r + k log n + 2 log C(P, s), and the noise filters of the model.
 
     L is the likelihood of the fitted recordings, n the number of compared samples of all joints, k
     the number of estimated values (minus combinations that the recordings do not determine) and
-    filter coefficients, and C(P, s) the number of sets of s of P effects. A smaller score is
+    filter coefficients, and C(P, s) the number of sets of s of P effects. r is the distance of the
+    values from those that were expected before the recordings, in deviations. A smaller score is
     better: the weight of a model is proportional to exp(-S/2) (Schwarz 1978; Chen and Chen 2008).
     """
 
@@ -35,6 +37,7 @@ def score(
     freedom: int,
     size: int,
     offered: int,
+    taken: Float[np.ndarray, " absorbed"] | None = None,
 ) -> Score:
     """The score of a model, with noise filters that are estimated from its residual.
 
@@ -44,16 +47,21 @@ def score(
     - `rest`: the residual of the model.
     - `freedom`: number of estimated physical values.
     - `size`: number of chosen effects. `offered`: number of effects to choose from.
+    - `taken`: changes of the base's values that belong to the residual; none if None.
     """
     outputs = range(rest.shape[2])
     series = [[r[m, j] for r, m in zip(rest, data.mask, strict=True)] for j in outputs]
-    return _scored(series, freedom, price(size, offered))
+    paid = price(size, offered) + float(np.sum(data.known_left(taken) ** 2))
+    return _scored(series, freedom, paid)
 
 
 def score_of(fit: Fit, size: int = 0, offered: int = 0) -> Score:
     """The score of a fit, comparable with that of a prediction by `score`."""
     series = [[r[:, j] for r in fit.residuals] for j in range(fit.residuals[0].shape[1])]
-    return _scored(series, len(fit.names) - len(fit.undetermined), price(size, offered))
+    paid, prior = price(size, offered), prior_of(fit.loop, fit.recordings)
+    if prior is not None:
+        paid += float(np.sum(np.square(prior.left(np.asarray(fit.theta)))))
+    return _scored(series, len(fit.names) - len(fit.undetermined), paid)
 
 
 def noise_filters(

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, AsymmetricFriction, TorqueOffset
+from ..estimate.minimise import Prior
 from ..noise import ARFilter
 from ..parameters import Parameter, read_values
 from ..simulation.loop import ClosedLoop
@@ -52,7 +53,7 @@ def instead_of_offsets(predictor: Predictor, std: Float[np.ndarray, " values"]) 
     loop = predictor.system.loop
     smoothing, form = shapes_of_signs(loop)
     plain = predictor.predict([])
-    now = _score(predictor, plain.rest, plain.freedom).value
+    now = _score(predictor, plain.rest, plain.freedom, plain.taken).value
     found = []
     for p, place, joint in _offsets(loop):
         value = float(p.where(loop))
@@ -62,10 +63,11 @@ def instead_of_offsets(predictor: Predictor, std: Float[np.ndarray, " values"]) 
         sign = {"smoothing": float(smoothing[joint - 1]), "form": float(form[joint - 1])}
         there = without.predict([AsymmetricFriction(joint=joint, **sign)])
         if there.possible:
-            effect, then = there.effects[0], _score(without, there.rest, there.freedom)
+            effect = there.effects[0]
+            then = _score(without, there.rest, there.freedom, there.taken)
             loop = without.system.loop.add(effect)
-            coulomb, rest = _coulomb_alone(without, there)
-            alone = _score(without, rest, there.freedom - 1)
+            coulomb, rest, taken = _coulomb_alone(without, there)
+            alone = _score(without, rest, there.freedom - 1, taken)
             if alone.value < then.value:
                 effect, then = AsymmetricFriction(joint=joint, coulomb=coulomb, **sign), alone
                 loop = _without_viscous(without.system.loop.add(effect))
@@ -97,8 +99,11 @@ def _offsets(loop: ClosedLoop) -> Iterator[tuple[Parameter, int, int]]:
 
 def _coulomb_alone(
     without: Predictor, both: Prediction
-) -> tuple[float, Float[np.ndarray, "recordings samples outputs"]]:
-    """The Coulomb part of a predicted friction without its viscous part, and the residual."""
+) -> tuple[float, Float[np.ndarray, "recordings samples outputs"], Float[np.ndarray, " absorbed"]]:
+    """The Coulomb part of a predicted friction without its viscous part.
+
+    **Returns:** its value, the residual, and the changes of the base's values.
+    """
     (friction,) = both.effects
     assert isinstance(friction, AsymmetricFriction)
     own = free_of(friction)
@@ -109,7 +114,8 @@ def _coulomb_alone(
     coulomb = float(column @ left) / max(float(column @ column), 1e-300)
     data, base = without.data, without.system.base
     rest = data.residual - coulomb * both.moved[..., at]
-    return coulomb, (rest - base @ without.absorbed(rest)) * data.mask[..., None]
+    taken = without.absorbed(rest)
+    return coulomb, (rest - base @ taken) * data.mask[..., None], taken
 
 
 def _without_viscous(loop: ClosedLoop) -> ClosedLoop:
@@ -122,9 +128,10 @@ def _score(
     predictor: Predictor,
     rest: Float[np.ndarray, "recordings samples outputs"],
     freedom: int,
+    taken: Float[np.ndarray, " absorbed"],
 ) -> Score:
     """The score of a predicted model without the price of its effects."""
-    return score(predictor.data, rest, freedom, 0, 0)
+    return score(predictor.data, rest, freedom, 0, 0, taken)
 
 
 def _without(predictor: Predictor, p: Parameter, place: int, value: float) -> Predictor:
@@ -132,9 +139,13 @@ def _without(predictor: Predictor, p: Parameter, place: int, value: float) -> Pr
 
     Torque is linear in the offset, so the residual changes by its column.
     """
-    system = predictor.system
+    system, prior = predictor.system, predictor.system.prior
+    if prior is not None:
+        rows = np.delete(np.asarray(prior.rows), place, axis=1)
+        prior = Prior(rows, np.delete(np.asarray(prior.expected), place))
     changed = dataclasses.replace(
         system,
+        prior=prior,
         loop=system.loop.hold(**{p.name: 0.0}),
         residual=system.residual + value * system.base[..., place],
         base=np.delete(system.base, place, axis=-1),

@@ -80,8 +80,8 @@ class Predictor(eqx.Module):
         - `level`: noise level of each recording, as in `Data`.
         """
         none = np.zeros((*system.residual.shape, 0))
-        data = Data(system.residual, system.base, none, system.mask, level)
-        base = data.white(system.base, noise).reshape(-1, system.base.shape[-1])
+        data = Data(system.residual, system.base, none, system.mask, level, known=system.known)
+        base = data.white_columns(system.base, noise, slice(None))
         loop = system.loop
         bounds, theta = Bounds.of(loop.free_parameters), np.asarray(loop.theta)
         free = np.full(base.shape[1] - len(theta), np.inf)
@@ -129,7 +129,7 @@ class Predictor(eqx.Module):
         self, left: Float[np.ndarray, "recordings samples outputs"]
     ) -> Float[np.ndarray, " absorbed"]:
         """Changes of the base's values that explain most of a residual."""
-        white = self.data.white(left, self.noise).reshape(-1)
+        white = self.data.white_residual(left, self.noise)
         return least_squares(self.basis.T @ white, self.base, self.limits)[0]
 
     def _reached(self, effects: tuple[AbstractEffect, ...]) -> "_Reached":
@@ -141,7 +141,9 @@ class Predictor(eqx.Module):
         # A diverging response is rejected as a step.
         there = bool(np.isfinite(both).all())
         both = both if there else np.zeros_like(both)
-        white = self.data.white(both, self.noise).reshape(-1, both.shape[-1])
+        white = self.data.white_columns(both, self.noise)
+        known = self.data.known_left()
+        white[len(white) - len(known) :, 0] = known
         # Coordinates in the span of the whitened base, to which changes of the base are restricted.
         within = self.basis.T @ white
         taken, free = least_squares(within[:, 0], self.base, self.limits)

@@ -136,13 +136,12 @@ def _instead(predictor: Predictor, sign: Parameter) -> Callable[[np.ndarray], fl
     free = predictor.system.loop.free_parameters
     owner = [p.place[:2] == sign.place[:2] and p.place[2:] in OF_SIGN for p in free]
     gone = np.repeat(owner, [p.size for p in free])
-    kept = np.concatenate([~gone, np.ones(data.base.shape[-1] - len(gone), bool)])
-    white = data.white(data.base[..., kept], noise)
-    basis = spanned(white.reshape(-1, white.shape[-1]))
+    kept = np.flatnonzero(np.concatenate([~gone, np.ones(data.base.shape[-1] - len(gone), bool)]))
+    basis = spanned(data.white_columns(data.base[..., kept], noise, kept.tolist()))
     now = _white(predictor, data.residual)
 
     def gain(change: np.ndarray) -> float:
-        rest = data.white(data.residual - change, noise).reshape(-1)
+        rest = data.white_residual(data.residual - change, noise)
         rest = rest - basis @ (basis.T @ rest)
         return float(now @ now - rest @ rest)
 
@@ -257,5 +256,5 @@ def _white(
     predictor: Predictor, rows: Float[np.ndarray, "recordings samples outputs"]
 ) -> Float[np.ndarray, " rows"]:
     """Whitened rows minus what the base absorbs."""
-    white = predictor.data.white(rows, predictor.noise).reshape(-1)
+    white = predictor.data.white_residual(rows, predictor.noise)
     return white - predictor.basis @ (predictor.basis.T @ white)

@@ -29,6 +29,16 @@ def _places(numbers: Sequence[int], kept: tuple[int, ...] | None) -> list[int]:
     return [kept.index(number) for number in numbers]
 
 
+class Known(eqx.Module):
+    """What is known of the base's values before the recordings, as rows of deviation one.
+
+    - `rows`: derivatives by the values. `left`: expected minus fitted values, in deviations.
+    """
+
+    rows: Float[np.ndarray, "known absorbed"]
+    left: Float[np.ndarray, " known"]
+
+
 class Data(eqx.Module):
     """Residual and sensitivities at the samples; zero for padding.
 
@@ -36,6 +46,7 @@ class Data(eqx.Module):
     the signatures; `mask` is false for padding. Signatures are in single precision: there are many,
     and three digits suffice. `level` is the noise level of each recording relative to the mean;
     None if all are equal. `kept` are the numbers of the columns in the table; None for all columns.
+    `known` is what is known of the base's values; None if that is nothing.
     """
 
     residual: Rows
@@ -44,6 +55,7 @@ class Data(eqx.Module):
     mask: Bool[np.ndarray, "recordings samples"]
     level: Float[np.ndarray, "recordings outputs"] | None = None
     kept: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    known: Known | None = None
 
     def columns(
         self, numbers: Sequence[int]
@@ -73,6 +85,52 @@ class Data(eqx.Module):
             level = self.level.astype(x.dtype)[:, None]
             out /= level.reshape(*level.shape, *(1,) * (x.ndim - 3))
         return out
+
+    def white_residual(
+        self,
+        rest: Rows,
+        noise: Sequence[ARFilter],
+        taken: Float[np.ndarray, " absorbed"] | None = None,
+    ) -> Float[np.ndarray, " rows"]:
+        """A whitened residual, and below it what is left of the knowledge of the base's values.
+
+        **Arguments:**
+
+        - `taken`: changes of the base's values; none if None.
+        """
+        rows = self.white(rest, noise).reshape(-1)
+        return rows if self.known is None else np.append(rows, self.known_left(taken))
+
+    def white_columns(
+        self,
+        x: Float[np.ndarray, "recordings samples outputs columns"],
+        noise: Sequence[ARFilter],
+        base: Sequence[int] | slice | None = None,
+    ) -> Float[np.ndarray, "rows columns"]:
+        """Whitened columns, and below them their derivatives of what is known.
+
+        **Arguments:**
+
+        - `base`: places in the base of the first columns; the others are not known. None if no
+          column belongs to the base.
+        """
+        rows = self.white(x, noise).reshape(-1, x.shape[-1])
+        if self.known is None:
+            return rows
+        own = self.known.rows[:, slice(0) if base is None else base]
+        below = np.pad(own, ((0, 0), (0, x.shape[-1] - own.shape[1])))
+        return np.concatenate([rows, below.astype(rows.dtype)])
+
+    def known_left(
+        self, taken: Float[np.ndarray, " absorbed"] | None = None
+    ) -> Float[np.ndarray, " known"]:
+        """Expected minus estimated values of the base in deviations; empty if nothing is known.
+
+        **Arguments:** as for `white_residual`.
+        """
+        if self.known is None:
+            return np.zeros(0)
+        return self.known.left if taken is None else self.known.left - self.known.rows @ taken
 
     def middle(self, most: int, least: int = 1000) -> "Data":
         """The middle of each recording, with at most `most` rows in total.
@@ -175,9 +233,9 @@ class Whitened(eqx.Module):
     @classmethod
     def of(cls, data: Data, noise: Sequence[ARFilter]) -> "Whitened":
         """The problem of some data, through noise filters."""
-        r = data.white(data.residual, noise).reshape(-1)
-        z = data.white(data.base, noise).reshape(len(r), -1)
-        x = data.white(data.table, noise).reshape(len(r), -1)
+        r = data.white_residual(data.residual, noise)
+        z = data.white_columns(data.base, noise, slice(None))
+        x = data.white_columns(data.table, noise)
         size = np.sqrt(np.einsum("rc,rc->c", x, x))
         size[size == 0] = 1.0
         x /= size
@@ -190,7 +248,8 @@ class Whitened(eqx.Module):
         for some, of in zip(np.array_split(x, parts), np.array_split(single, parts), strict=True):
             some -= of @ across
         unknown = len(data.mask) * sum(f.order for f in noise)
-        count = data.mask.sum() * data.residual.shape[2] - unknown - basis.shape[1]
+        rows = data.mask.sum() * data.residual.shape[2] + len(data.known_left())
+        count = rows - unknown - basis.shape[1]
         return cls(r, x, size.astype(float), float(count))
 
     def score(self) -> Float[np.ndarray, " columns"]:

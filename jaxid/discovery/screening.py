@@ -79,6 +79,7 @@ def screen(fit: Fit | Comparison, catalogue: Sequence[Any], say: Callable[[str],
         base=system.base,
         table=at_samples(system.batch, table),
         mask=system.mask,
+        known=system.known,
     )
     say(f"scoring {len(hypotheses)} hypotheses")
     return Screened(system, tuple(hypotheses), data, scene)
@@ -113,7 +114,7 @@ def carried(screened: Screened, before: Fit, after: Fit) -> Screened | None:
         return None
     loop = system.loop.with_theta(jax.device_put(after.theta))
     system = dataclasses.replace(system, loop=loop, residual=left)
-    data = dataclasses.replace(screened.data, residual=left)
+    data = dataclasses.replace(screened.data, residual=left, known=system.known)
     return dataclasses.replace(screened, system=system, data=data)
 
 

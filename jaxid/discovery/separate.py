@@ -153,8 +153,8 @@ def leftover(data: Data, noise: Sequence[ARFilter], columns: Sequence[int]) -> R
     """The residual minus the best combination of base and signatures, whitened by `noise`."""
     picked = data.columns(columns).astype(float)
     wide = np.concatenate([data.base, picked], axis=-1)
-    w = data.white(wide, noise).reshape(-1, wide.shape[-1])
-    r = data.white(data.residual, noise).reshape(-1)
+    w = data.white_columns(wide, noise, slice(None))
+    r = data.white_residual(data.residual, noise)
     size = np.linalg.norm(w, axis=0)
     size[size == 0] = 1.0
     w /= size

@@ -10,15 +10,17 @@ from jaxtyping import Array, Bool, Float
 from ..errors import FitError
 from ..estimate import Fit
 from ..estimate.converge import from_best_starts
-from ..estimate.minimise import simulated_with_slopes
+from ..estimate.minimise import Prior, simulated_with_slopes
 from ..estimate.oem import oem_of
 from ..estimate.pieces import compared_signals, estimated_starts, pieces_of
+from ..estimate.prior import prior_of
 from ..simulation.batch import Batch, prepare
 from ..simulation.integration import SIGNALS
 from ..simulation.loop import ClosedLoop
 from ..simulation.steps import with_substeps
 from .comparison import Comparison
 from .linear import Linearised, at_samples, base_columns, linearise, sampled
+from .score import Known
 from .signatures import left_for_links
 
 
@@ -30,6 +32,7 @@ class System(eqx.Module):
     - `residual`: measured minus simulated output at the samples, in the compared band.
     - `base`: derivatives of the output by the free parameters and by the estimated initial states.
     - `row`: index of the compared signal in `SIGNALS`.
+    - `prior`: of the free parameters; None if nothing is known of them.
     """
 
     loop: ClosedLoop
@@ -39,6 +42,7 @@ class System(eqx.Module):
     residual: Float[np.ndarray, "recordings samples outputs"]
     base: Float[np.ndarray, "recordings samples outputs absorbed"]
     row: int = eqx.field(static=True)
+    prior: Prior | None = None
 
     @classmethod
     def of(cls, fit: Fit | Comparison) -> "System":
@@ -57,7 +61,17 @@ class System(eqx.Module):
                 "analyse: fit it by OEM first"
             )
         left = left_for_links(loop, linear.motion)
-        return cls(loop, advanced(batch, loop), linear, left, residual, base, row)
+        prior = prior_of(loop, fit.recordings)
+        return cls(loop, advanced(batch, loop), linear, left, residual, base, row, prior)
+
+    @property
+    def known(self) -> Known | None:
+        """The rows of the prior for the columns of the base."""
+        if self.prior is None:
+            return None
+        rows = np.asarray(self.prior.rows)
+        rows = np.pad(rows, ((0, 0), (0, self.base.shape[-1] - rows.shape[1])))
+        return Known(rows, np.asarray(self.prior.left(np.asarray(self.loop.theta))))
 
     @property
     def mask(self) -> Bool[np.ndarray, "recordings samples"]:

@@ -175,8 +175,9 @@ class WhatIf(eqx.Module):
         columns = predictor.shown(effect)[..., 1:]
         names = [n for p in free_of(effect) for n in p.names]
         at = [names.index(n) for p in linear for n in p.names]
-        white = predictor.data.white(columns[..., at], predictor.noise).reshape(-1, len(at))
-        left = predictor.data.white(predictor.data.residual, predictor.noise).reshape(-1)
+        data = predictor.data
+        white = data.white_columns(columns[..., at], predictor.noise)
+        left = data.white_residual(data.residual, predictor.noise)
         white = white - predictor.basis @ (predictor.basis.T @ white)
         basis = spanned(white)
         bounds = Bounds.of(linear)

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import Array, Bool, Float, Int
 
@@ -141,6 +142,17 @@ class AbstractEffect(eqx.Module):
         - `scene`: the recorded motion. `beside`: the other effects of the model.
         """
         return True
+
+    def likely(self, torque: Float[np.ndarray, " joints"]) -> dict[str, float]:
+        """Standard deviations of its values around zero before any recording, by field.
+
+        Values that are not named may have any size; none is named by default.
+
+        **Arguments:**
+
+        - `torque`: root mean square of the recorded torque, `(joints,)`, N·m or N.
+        """
+        return {}
 
     def initial_state(self) -> Float[Array, " states"]:
         """States of the effect at rest; none by default."""

@@ -41,8 +41,17 @@ class TorqueRipple(AbstractEffect):
         return on_joint(self.joint, wave, motion)
 
 
+# Standard deviation of an offset before any recording, relative to the recorded torque.
+_LIKELY = 0.1
+
+
 class TorqueOffset(AbstractEffect):
-    """A constant torque at one joint: amplifier offset, wrong balance weight."""
+    """A constant torque at one joint: amplifier offset, wrong balance weight.
+
+    An offset of much more than a tenth of the recorded torque is unlikely: it rather stands for a
+    torque that changes little along the recorded motion. Estimates are drawn to zero accordingly,
+    which matters only where the recordings hardly tell the two apart.
+    """
 
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
@@ -51,6 +60,10 @@ class TorqueOffset(AbstractEffect):
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """The offset on the joint, `(joints,)`."""
         return on_joint(self.joint, self.level, motion)
+
+    def likely(self, torque: Float[np.ndarray, " joints"]) -> dict[str, float]:
+        """A tenth of the recorded torque."""
+        return {"level": _LIKELY * float(torque[self.joint - 1])}
 
 
 class Spring(AbstractEffect):

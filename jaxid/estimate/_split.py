@@ -246,9 +246,9 @@ def _coloured(stacked: Stacked, solved: Solved, names: tuple[str, ...]) -> Solve
     spread = np.where(spread > 0, spread, 1.0)
     residuals = stacked.split(solved.residual / spread)
     jacobians = stacked.split(stacked.columns / spread[:, None])
-    information = sum(np.einsum("kop,koq->pq", j, j) for j in jacobians)
-    meat = score_covariance(residuals, jacobians)
-    covariance, lost = determined_covariance(np.asarray(information), names, stacked.scales, meat)
+    information = np.asarray(sum(np.einsum("kop,koq->pq", j, j) for j in jacobians))
+    meat = score_covariance(residuals, jacobians, information)
+    covariance, lost = determined_covariance(information, names, stacked.scales, meat)
     return Solved(solved.theta, covariance, solved.residual, lost)
 
 

@@ -36,6 +36,7 @@ from .pieces import (
     first_weights,
     pieces_of,
 )
+from .prior import prior_of
 from .result import Status
 
 
@@ -88,8 +89,9 @@ def converge(
     held = _delays(loop) & (weights is None and filters is None)
     if weights is None and filters is not None:
         weights = _weights_of(filters, first)
-    # For a single output the weight only scales the loss.
-    alone = len(first) == 1
+    prior = prior_of(loop, recordings)
+    # For a single output the weight only scales the loss, if there is no prior.
+    alone = len(first) == 1 and prior is None
     # Until the weights are known, a rough minimum is enough.
     worth = 1e-4 if alone or weights is not None else 1e-2
     weights = jnp.asarray(first if weights is None else weights)
@@ -100,7 +102,7 @@ def converge(
         noise = jax.device_put(_taps(filters, weights))
         kinds = signals, bool(estimated.any()), method.mesh
         mix = _mix(filters, weights)
-        return Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix)
+        return Problem(loop, batch, weights, noise, free, *within, *kinds, mix=mix, prior=prior)
 
     total, minimum, ratio, again = 0, None, jnp.ones_like(first), False
     problem = posed(weights)

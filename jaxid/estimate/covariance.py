@@ -121,15 +121,18 @@ def covariance_of(
         return determined_covariance(_papers_information(optimum, noise), names, scales)
     reduced = Reduced.of(optimum, found)
     jacobians, meat = reduced.jacobians, None
-    if kind == "sandwich":
-        meat = score_covariance(reduced.residuals, jacobians)
-    elif kind == "newey_west":
-        meat = newey_west(reduced.residuals, jacobians)
-    else:
+    if kind == "white":
         whiten = np.linalg.inv(np.linalg.cholesky(reduced.spread(problem.mix is not None)))
         jacobians = [np.einsum("ij,kjp->kip", whiten, j) for j in jacobians]
-    information = sum(np.einsum("kop,koq->pq", j, j) for j in jacobians)
-    return determined_covariance(np.asarray(information), names, scales, meat)
+    known = np.zeros((problem.loop.theta.shape[0],) * 2)
+    if problem.prior is not None:
+        known = np.asarray(problem.prior.rows.T @ problem.prior.rows)
+    information = known + sum(np.einsum("kop,koq->pq", j, j) for j in jacobians)
+    if kind == "sandwich":
+        meat = known + score_covariance(reduced.residuals, jacobians, information)
+    elif kind == "newey_west":
+        meat = known + newey_west(reduced.residuals, jacobians)
+    return determined_covariance(information, names, scales, meat)
 
 
 _plain = compiled(unfiltered)
@@ -158,15 +161,24 @@ def _papers_information(
 def score_covariance(
     residuals: Sequence[Float[np.ndarray, "_samples outputs"]],
     jacobians: Sequence[Float[np.ndarray, "_samples outputs parameters"]],
+    information: Float[np.ndarray, "parameters parameters"],
 ) -> Float[np.ndarray, "parameters parameters"]:
     """Covariance of J'r for coloured residuals, from their spectrum and that of J.
 
     Each output's residuals are modelled as one autoregressive process over all recordings, with the
     order chosen by AIC, and with a level for each recording, because noise that grows with the
     torque is strongest where the derivatives are largest. Outputs are assumed to be uncorrelated.
+    The residual lacks what the parameters absorb, most of all at the frequencies of the motion, and
+    its spectrum is corrected for that (leverage in the frequency domain).
+
+    **Arguments:**
+
+    - `information`: J'J, with that of a prior.
     """
     outputs, p = jacobians[0].shape[1:]
-    meat = np.zeros((p, p))
+    size = np.sqrt(np.diag(information))
+    units = np.outer(*[np.where(size > 0, size, 1.0)] * 2)
+    meat, inverse = np.zeros((p, p)), np.linalg.pinv(information / units, hermitian=True) / units
     for o in range(outputs):
         series = [r[:, o] - r[:, o].mean() for r in residuals]
         strengths = [float(np.std(x)) or 1.0 for x in series]
@@ -182,9 +194,15 @@ def score_covariance(
         for j, strength in zip(jacobians, strengths, strict=True):
             size = 1 << int(np.ceil(np.log2(2 * j.shape[0])))
             wave = np.fft.fft(j[:, o], size, axis=0)
-            power = strength**2 * noise.spectrum(size)[:, None]
+            leverage = np.real(np.einsum("fp,pq,fq->f", wave.conj(), inverse, wave)) / j.shape[0]
+            kept = np.maximum(1 - leverage, _KEPT)
+            power = (strength**2 * noise.spectrum(size) / kept)[:, None]
             meat += np.real(wave.conj().T @ (power * wave)) / size
     return meat
+
+
+# Smallest share of the noise at a frequency that a residual is assumed to keep.
+_KEPT = 0.1
 
 
 def newey_west(

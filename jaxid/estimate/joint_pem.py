@@ -23,6 +23,7 @@ from .minimise import Coefficients, Minimum, Problem, Stopping, minimise
 from .oem import OEM
 from .pem import Order, keeping, noise_filters
 from .pieces import compared_signals, estimated_starts, first_weights, pieces_of
+from .prior import prior_of
 from .reporting import report
 from .result import AbstractMethod, Fit, Status
 from .start import start_values
@@ -126,6 +127,7 @@ def _converge_jointly(
     problem = Problem(
         loop, batch, weights, blank, free, lower, upper, signals, bool(free.any()),
         mesh=oem.mesh, coefficients=coefficients, mix=jnp.eye(outputs),
+        prior=prior_of(loop, recordings),
     )  # fmt: skip
     _check_samples(problem, orders)
     theta = jnp.concatenate([loop.theta, jnp.asarray(_starting(problem, noise))])

@@ -12,6 +12,7 @@ from .minimum import Minimum as Minimum
 from .minimum import Stopping as Stopping
 from .minimum import descend as descend
 from .minimum import minimise as minimise
+from .prior import Prior as Prior
 from .problem import Point as Point
 from .problem import Problem as Problem
 from .problem import Sums as Sums

@@ -53,6 +53,22 @@ def linearisation(problem: Problem, whole: bool = False) -> Callable[[Any, Any],
 
     - `whole`: keep all derivatives; otherwise only if they are small.
     """
+    if problem.prior is None:
+        return _of_recordings(problem, whole)
+    # A prior counts once, however the recordings are divided.
+    inner = _of_recordings(dataclasses.replace(problem, prior=None), whole)
+    prior = jax.device_get(problem.prior)
+
+    def at(theta: Any, start: Any) -> Point:
+        point = inner(theta, start)
+        sums, loss = jax.device_get((point.sums, point.loss))
+        return dataclasses.replace(point, sums=sums, loss=loss).beside(prior, np)
+
+    return at
+
+
+def _of_recordings(problem: Problem, whole: bool) -> Callable[[Any, Any], Point]:
+    """`linearisation` of a problem without a prior."""
     mesh = problem.mesh
     if mesh is not None and not of_this_machine(mesh):
         return lambda theta, start: _over_mesh(problem, mesh, theta, start)

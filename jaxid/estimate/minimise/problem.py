@@ -1,6 +1,7 @@
 """The least-squares problem of a simulated loop, and its products around a point."""
 
 import dataclasses
+from types import ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -19,13 +20,15 @@ from ...simulation.sharing import (
 from .arrow import Arrow, Unknowns
 from .descent import Products
 from .filtering import Coefficients, known_rows
+from .prior import Prior
 from .residual import Sensitivity, mixed, raw_residual, through_filter, unfiltered
 
 
 class Sums(eqx.Module):
     """Products of residual and derivatives, separately for each output.
 
-    They can be scaled to new weights of the outputs without another simulation.
+    They can be scaled to new weights of the outputs without another simulation. The rows of a prior
+    are one more output, whose weight stays the same.
 
     - `loss`: r'r. `gram`, `slope`: J'J and J'r of the parameters.
     - `start_gram`, `start_slope`: J'J and J'r of each recording's initial state. `cross`: J'J
@@ -77,6 +80,22 @@ class Sums(eqx.Module):
         _, gram, slope, start_gram, start_slope, cross = self.added()
         return Products(loss / 2, (slope, start_slope), Arrow(gram, start_gram, cross))
 
+    def beside(self, prior: Prior, theta: Float[Any, " parameters"], xp: ModuleType) -> "Sums":
+        """The products with those of a prior as one more output.
+
+        **Arguments:**
+
+        - `theta`: parameter values. `xp`: `numpy` or `jax.numpy`.
+        """
+        own = dict(zip(("loss", "gram", "slope"), prior.products(theta, xp), strict=True))
+
+        def more(name: str) -> Any:
+            x = getattr(self, name)
+            last = own[name] if name in own else xp.zeros(x.shape[1:])
+            return xp.concatenate([xp.asarray(x), last[None]])
+
+        return Sums(**{f.name: more(f.name) for f in dataclasses.fields(self)})
+
     def weighted(self, ratio: Float[np.ndarray, " outputs"]) -> "Sums":
         """The products for other weights of the outputs.
 
@@ -84,6 +103,7 @@ class Sums(eqx.Module):
 
         - `ratio`: new weights over former ones.
         """
+        ratio = np.append(ratio, np.ones(len(self.loss) - len(ratio)))
 
         def scaled(x: Any) -> np.ndarray:
             return np.asarray(x) * np.reshape(ratio**2, (-1, *(1,) * (np.ndim(x) - 1)))
@@ -121,6 +141,18 @@ class Point(eqx.Module):
         theta = jnp.asarray(np.asarray(self.theta)[kept])
         return dataclasses.replace(self, theta=theta, found=found, sums=self.sums.with_only(kept))
 
+    def beside(self, prior: Prior | None, xp: ModuleType) -> "Point":
+        """The point of a problem with a prior.
+
+        **Arguments:**
+
+        - `xp`: `numpy` or `jax.numpy`.
+        """
+        if prior is None:
+            return self
+        sums = self.sums.beside(prior, xp.asarray(self.theta), xp)
+        return dataclasses.replace(self, sums=sums, loss=self.loss + sums.loss[-1])
+
 
 class Problem(eqx.Module):
     """The residual to minimise, and the bounds of its parameters.
@@ -131,6 +163,7 @@ class Problem(eqx.Module):
       vector; None if the filter is given.
     - `mix`: matrix that makes filtered outputs white and uncorrelated, `(outputs, outputs)`; None
       if the weights suffice.
+    - `prior`: knowledge of the loop's parameters before the recordings; None if there is none.
     """
 
     loop: ClosedLoop
@@ -145,6 +178,7 @@ class Problem(eqx.Module):
     mesh: Mesh | None = eqx.field(static=True, default=None)
     coefficients: Coefficients | None = None
     mix: Float[Array, "outputs outputs"] | None = None
+    prior: Prior | None = None
 
     @property
     def rows(self) -> int:
@@ -229,7 +263,8 @@ class Problem(eqx.Module):
         if not imposed(loop):
             # Inverse dynamics allows any inertia; a simulation needs a positive one.
             sound = sound & (loop.arm.smallest_inertia() > 0)
-        return Point(theta, start, found, sums, jnp.where(sound, loss, jnp.inf))
+        point = Point(theta, start, found, sums, jnp.where(sound, loss, jnp.inf))
+        return point.beside(self.prior, jnp)
 
 
 @compiled

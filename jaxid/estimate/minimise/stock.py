@@ -70,8 +70,10 @@ class Transformed(eqx.Module):
         return self.bounds.inside(z[0]), z[1] if self.problem.free_start else self.start
 
     def residual(self, z: Unknowns, args: None) -> tuple[Float[Array, " rows"], None]:
-        """The filtered residual."""
-        return _residual(self.inside(z), self.problem), None
+        """The filtered residual, with the rows of a prior."""
+        at, prior = self.inside(z), self.problem.prior
+        rows = _residual(at, self.problem)
+        return (rows if prior is None else jnp.append(rows, prior.left(at[0]))), None
 
     def loss(self, z: Unknowns, args: None) -> tuple[Float[Array, ""], None]:
         """Half the squared residual."""
