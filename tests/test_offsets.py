@@ -132,9 +132,10 @@ def test_friction_by_direction_is_named_and_an_offset_is_not():
 def test_where_noise_hides_the_difference_both_have_a_weight():
     found = searched(True, noise=2.0)
     assert found.verdict == "undetermined"
-    assert "asymmetric_friction on joint 1 has 0.87" in found.reason
+    assert "asymmetric_friction on joint 1 has 0.95" in found.reason
     assert any("may also be asymmetric_friction" in note for note in found.notes)
     weights = found.models.set_index("model")["weight"]
-    # Neither has a price that the other has not, so the friction that is there has more weight.
-    assert 0.5 < weights["asymmetric_friction on joint 1"] < 0.95
+    # Both have one value, and an offset of this size is less likely: the friction that is there has
+    # more weight.
+    assert 0.5 < weights["asymmetric_friction on joint 1"] < 0.97
     assert weights.sum() == pytest.approx(1.0)

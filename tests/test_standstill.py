@@ -3,6 +3,8 @@
 Torque is that of inverse dynamics written out here, along motions in closed form.
 """
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -22,17 +24,17 @@ def axis(still=None):
     return jaxid.ClosedLoop(arm, law, effects, name="axis", standstill=standstill)
 
 
-def recorded(seed, friction):
+def recorded(seed, friction, size=1.0):
     """An axis that often moves slowly.
 
     **Arguments:**
 
-    - `friction`: function of time, position and speed, N.
+    - `friction`: function of time, position and speed, N. `size`: of the motion.
     """
     rng = np.random.default_rng(seed)
     time = np.arange(0.0, 20.0, 0.002)
     rates, phases = 2 * np.pi * np.array([0.11, 0.33, 0.7]), rng.uniform(0, 6, 3)
-    sizes = np.array([0.2, 0.07, 0.01])
+    sizes = size * np.array([0.2, 0.07, 0.01])
 
     def motion(order):
         turned = time[:, None] * rates + phases + order * np.pi / 2
@@ -151,3 +153,28 @@ def test_under_a_simulated_law_a_good_model_needs_all_samples():
     assert (
         worst_at_standstill(jaxid.fit(held(Standstill()), runs, jaxid.OEM(progress=False))) is None
     )
+
+
+def test_unseen_samples_slower_than_any_fitted_one_are_not_compared():
+    fast = recorded(1, lambda time, q, v: DRY * np.tanh(v / 0.002))
+    highest = np.abs(np.gradient(fast.q[:, 0], fast.time)).max()
+
+    def creeping(time, q, v):
+        slow = np.abs(v) < 0.01 * highest
+        return np.where(slow, DRY * np.sin(40 * time), DRY * np.tanh(v / 0.002))
+
+    fit = jaxid.fit(axis(), fast)
+    found = fit.loop.standstill
+    np.testing.assert_allclose(found.speed, highest, rtol=0.01)
+    slower = recorded(2, creeping, size=0.3)
+    own = np.abs(np.gradient(slower.q[:, 0], slower.time))
+    there, before = (x.moving(slower, 20.0)[:, 0] for x in (found, Standstill().settled(1, True)))
+    assert not there[own < 0.009 * highest].any()
+    assert there[own > 0.1 * highest].any()
+    assert before[(own < 0.009 * highest) & (own > 0.004 * highest)].any()
+    for recording in (fast, recorded(3, creeping, size=2.0)):
+        expected = Standstill().settled(1, True).moving(recording, 20.0)
+        np.testing.assert_array_equal(found.moving(recording, 20.0), expected)
+    error = jaxid.compare(fit.loop, slower).error_percent.to_numpy()
+    forgotten = dataclasses.replace(fit.loop, standstill=Standstill().settled(1, True))
+    assert error < 0.7 * jaxid.compare(forgotten, slower).error_percent.to_numpy()

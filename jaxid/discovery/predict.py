@@ -61,6 +61,7 @@ class Predictor(eqx.Module):
 
     - `basis`: orthonormal basis of the span of the whitened base. `base`: the whitened base in it.
     - `limits`: smallest and largest change of the base's values.
+    - `rank`: number of the base's values that the recordings determine.
     """
 
     system: System
@@ -69,6 +70,7 @@ class Predictor(eqx.Module):
     basis: Float[np.ndarray, "rows rank"]
     base: Float[np.ndarray, "rank absorbed"]
     limits: tuple[Float[np.ndarray, " absorbed"], Float[np.ndarray, " absorbed"]]
+    rank: int
 
     @classmethod
     def of(cls, system: System, noise: Sequence[ARFilter], level: Any = None) -> "Predictor":
@@ -88,7 +90,9 @@ class Predictor(eqx.Module):
         lower = np.append(np.minimum(np.asarray(bounds.lower) - theta, 0.0), -free)
         upper = np.append(np.maximum(np.asarray(bounds.upper) - theta, 0.0), free)
         basis = spanned(base)
-        return cls(system, data, tuple(noise), basis, basis.T @ base, (lower, upper))
+        rows = len(base) - len(data.known_left())
+        rank = basis.shape[1] if rows == len(base) else spanned(base[:rows]).shape[1]
+        return cls(system, data, tuple(noise), basis, basis.T @ base, (lower, upper), rank)
 
     def predict(self, effects: Sequence[AbstractEffect], steps: int = 20) -> Prediction:
         """A set of effects with their values estimated together, from their current values.
@@ -244,7 +248,7 @@ class Predictor(eqx.Module):
             taken=found.taken,
             loss=float(found.loss),
             # A value that the base absorbs is not determined.
-            freedom=self.basis.shape[1] + int(np.count_nonzero(found.white[:, 1:].any(axis=0))),
+            freedom=self.rank + int(np.count_nonzero(found.white[:, 1:].any(axis=0))),
             possible=bool(there) and sized,
         )
 

@@ -15,7 +15,7 @@ from ..control import Reading, Sampled
 from ..effects import AbstractEffect, AbstractTransmission, check_declared
 from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
-from ..simulation.batch import at_rest, check_joints, check_law
+from ..simulation.batch import at_rest, check_joints, check_law, motion_cutoff
 from ..simulation.loop import ClosedLoop
 from ..simulation.sharing import with_one_blas_thread
 from .drawn import contradiction
@@ -50,7 +50,9 @@ def fit(
     law, given = loop.controller, loop.standstill
     loop = dataclasses.replace(loop, controller=law.settled(recordings))
     if law.imposes:
-        loop = dataclasses.replace(loop, standstill=given.settled(loop.joints, imposed=True))
+        cutoff = motion_cutoff(loop.controller, recordings)
+        still = given.settled(loop.joints, imposed=True).within(recordings, cutoff)
+        loop = dataclasses.replace(loop, standstill=still)
     for effect in loop.effects:
         check_declared(effect, loop.joints)
     method = OEM() if method is None else method

@@ -124,15 +124,18 @@ def covariance_of(
     if kind == "white":
         whiten = np.linalg.inv(np.linalg.cholesky(reduced.spread(problem.mix is not None)))
         jacobians = [np.einsum("ij,kjp->kip", whiten, j) for j in jacobians]
-    known = np.zeros((problem.loop.theta.shape[0],) * 2)
-    if problem.prior is not None:
-        known = np.asarray(problem.prior.rows.T @ problem.prior.rows)
-    information = known + sum(np.einsum("kop,koq->pq", j, j) for j in jacobians)
+    own = np.asarray(sum(np.einsum("kop,koq->pq", j, j) for j in jacobians))
+    rows = np.zeros((0, len(names))) if problem.prior is None else np.asarray(problem.prior.rows)
+    known = rows.T @ rows
     if kind == "sandwich":
-        meat = known + score_covariance(reduced.residuals, jacobians, information)
+        meat = known + score_covariance(reduced.residuals, jacobians, own + known)
     elif kind == "newey_west":
         meat = known + newey_west(reduced.residuals, jacobians)
-    return determined_covariance(information, names, scales, meat)
+    covariance, lost = determined_covariance(own + known, names, scales, meat)
+    if problem.prior is not None and np.isfinite(own).all():
+        # A prior makes deviations finite, also where recordings say nothing.
+        lost = determined_covariance(own, names, scales)[1]
+    return covariance, lost
 
 
 _plain = compiled(unfiltered)

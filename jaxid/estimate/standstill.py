@@ -76,7 +76,8 @@ def worst_at_standstill(found: Fit) -> Standstill | None:
         return None
     if found.status is Status.misfit:
         return None
-    usual = Standstill().settled(loop.joints, imposed=True)
+    cutoff = motion_cutoff(loop.controller, found.recordings)
+    usual = Standstill().settled(loop.joints, imposed=True).within(found.recordings, cutoff)
     rest, slow, speed, _ = _slow(found, usual, _motions(found))
     fast = (rest != 0) & ~slow & (np.abs(speed) > _LARGEST)
     counts = [np.sum(there, axis=0) for there in (slow, fast)]

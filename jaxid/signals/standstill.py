@@ -1,6 +1,7 @@
 """The samples at which a joint moves, where its torque is a function of the motion."""
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -36,10 +37,13 @@ class Standstill(eqx.Module):
     - `reach`: time from such samples within which torque is not compared either, in periods of the
       cutoff of the motion, or of 30 ms if they are shorter; one for all joints or one per joint. By
       default one. A fit raises it to two if a jump of friction visibly spreads further.
+    - `speed`: speed of each joint that `still` refers to in recordings with a lower highest speed,
+      rad/s or m/s. A fit sets it by its recordings (`within`).
     """
 
     still: float | Float[Any, " joints"] | None = None
     reach: float | Float[Any, " joints"] | None = None
+    speed: Float[Any, " joints"] | None = None
 
     @property
     def chosen(self) -> bool:
@@ -60,6 +64,19 @@ class Standstill(eqx.Module):
             reach=each + np.asarray(REACH if self.reach is None else self.reach),
         )
 
+    def within(self, recordings: Iterable[Recording], cutoff: float) -> "Standstill":
+        """The same, for use on other recordings after a fit of these.
+
+        The friction at speeds below the slowest compared samples is not known from these
+        recordings, so such samples of other recordings are not compared.
+
+        **Arguments:**
+
+        - `cutoff`: frequency up to which the recorded motion is known, Hz.
+        """
+        highest = [np.abs(_speed(r, cutoff)).max(axis=0) for r in recordings]
+        return dataclasses.replace(self, speed=np.min(highest, axis=0))
+
     def moving(self, recording: Recording, cutoff: float) -> Bool[np.ndarray, "samples joints"]:
         """Samples at which a joint moves, further from standstill than the reach.
 
@@ -71,9 +88,11 @@ class Standstill(eqx.Module):
         """
         settled = self.settled(recording.joints, imposed=True)
         still, reach = np.asarray(settled.still), np.asarray(settled.reach)
-        time = even_times(recording)
-        speed = np.gradient(smooth_motion(recording, cutoff), time, axis=0)
-        standing = np.abs(speed) < still * np.abs(speed).max(axis=0)
+        speed = _speed(recording, cutoff)
+        highest = np.abs(speed).max(axis=0)
+        if self.speed is not None:
+            highest = np.maximum(highest, np.asarray(self.speed))
+        standing = np.abs(speed) < still * highest
         # A fast reversal may be between two samples.
         turns = (speed[1:] * speed[:-1] < 0) & (still > 0)
         standing[1:] |= turns
@@ -81,6 +100,11 @@ class Standstill(eqx.Module):
         memory = recording.rate * max(1 / cutoff, _PRESLIDING)
         pairs = zip(standing.T, memory * reach, strict=True)
         return np.stack([_far_from(column, span) for column, span in pairs], axis=1)
+
+
+def _speed(recording: Recording, cutoff: float) -> Float[np.ndarray, "samples joints"]:
+    """The speed of the low-passed motion."""
+    return np.gradient(smooth_motion(recording, cutoff), even_times(recording), axis=0)
 
 
 def _far_from(there: Bool[np.ndarray, " samples"], reach: float) -> Bool[np.ndarray, " samples"]:
