@@ -26,8 +26,8 @@ DATA = Path(__file__).parents[1].parent / "shared" / "data"
 KR300_CUTOFF, TX40_CUTOFF, TX40_EVERY = 5.0, 100.0, 20
 
 
-def kr300() -> tuple[jaxid.ClosedLoop, jaxid.Recording, jaxid.Recording]:
-    """The arm with its drawn bodies and rotors, recording A and recording B."""
+def kr300(bodies: str = "drawn") -> tuple[jaxid.ClosedLoop, jaxid.Recording, jaxid.Recording]:
+    """The arm with its rotors, recording A and recording B."""
     folder = DATA / "kr300"
     model = json.loads((folder / "kr300_model.json").read_text(encoding="utf-8"))
     rotors = []
@@ -35,7 +35,7 @@ def kr300() -> tuple[jaxid.ClosedLoop, jaxid.Recording, jaxid.Recording]:
         above, below = (float(x) for x in f"{joint['gear_ratio']}/1".split("/")[:2])
         rotors.append(joint["motor_inertia"] * (above / below) ** 2)
     law = Tracking(cutoff=KR300_CUTOFF)
-    loop = jaxid.serial(folder / "kr300.urdf", law, rotors=tuple(rotors))
+    loop = jaxid.serial(folder / "kr300.urdf", law, rotors=tuple(rotors), bodies=bodies)
     a, b = jaxid.read(folder / "kr300_A.csv.gz", folder / "kr300_B.csv.gz", columns={"time": "t"})
     return loop, a, b
 
@@ -91,6 +91,11 @@ def fits(quick: bool) -> pd.DataFrame:
         ("KR300", "and a spring on joint 2"): row(sprung, a, b, Spring(joint=2)),
         ("KR300", "and a counterbalance"): row(loop, a, b, Counterbalance(joint=2, angle=0.1)),
     }
+    for bodies, said in () if quick else (("near", "near the drawing"), ("free", "free")):
+        loop, *_ = kr300(bodies)
+        rows["KR300", f"bodies {said}"] = row(loop, a, b)
+        more = Counterbalance(joint=2, angle=0.1)
+        rows["KR300", f"bodies {said}, counterbalance"] = row(loop, a, b, more)
     shaft = SharedShaft(joint=5, driven=6, smoothing=1e-4)
     loop, whole, first, rest = tx40("drawn" if quick else "free")
     what = "bodies as drawn" if quick else "base parameters free"

@@ -88,7 +88,7 @@ def serial(
       their base parameters, `"near"` to estimate them as far as the recordings contradict the
       values of the file.
     - `uncertainty`: relative standard deviation of masses and inertias in the file, for `"near"`
-      (`jaxid.arms.drawn_covariance`).
+      (`jaxid.arms.drawn_covariance`). Regressions (`IDIM`, `DIDIM`) ignore it.
     - `base`, `tip`, `gravity`: as for `SerialArm.from_urdf`.
 
     **Raises:** `ModelError` for a file that describes no serial arm.

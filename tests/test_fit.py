@@ -205,7 +205,7 @@ def test_an_undetermined_direction_is_named_and_the_rest_found(cases):
     names = list(fit.names)
     assert len(fit.undetermined) == 1
     assert "offset2, offset2_2" in fit.undetermined[0]
-    # Nothing is known of it but that offsets are a tenth of the torque.
+    # All that is known of it is that offsets are a tenth of the torque.
     torque = np.concatenate([r.tau[:, 1] for r in fit.recordings])
     likely = 0.1 * np.sqrt(np.mean(torque**2) / 2)
     assert fit.std[names.index("offset2")] == pytest.approx(likely, rel=1e-3)

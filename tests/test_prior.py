@@ -165,6 +165,18 @@ def test_the_optimum_is_that_of_recordings_and_knowledge_together(fitted):
     assert np.abs(slopes[:, 0]).max() > 0.5
 
 
+def test_values_that_only_the_drawing_tells_are_named(fitted):
+    (said,) = [n for n in fitted.notes if "those of the drawing" in n]
+    before = np.sqrt(np.diag(np.asarray(fitted.loop.arm.covariance)))
+    count = len(before)
+    ratio = fitted.std[:count] / before
+    assert np.all(ratio < 1.001)
+    named = [n for n, x in zip(fitted.names[:count], ratio, strict=True) if x > 0.7]
+    assert named
+    assert said.startswith(f"{len(named)} of {count} base parameters")
+    assert said.endswith(", ".join(named))
+
+
 def test_another_solver_finds_the_same(fitted):
     (fitting, _), _ = drawn_case(0)
     other = jaxid.fit(near(), fitting, method=jaxid.OEM(solver=optx.LevenbergMarquardt(1e-9, 1e-9)))

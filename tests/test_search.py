@@ -14,12 +14,12 @@ from stories import recordings_of, search_of, two_link_of, with_chain
 
 import jaxid
 from jaxid.discovery.bounded import bounded_amplitudes
+from jaxid.discovery.data import Data
 from jaxid.discovery.diagnosis import over_recordings
 from jaxid.discovery.explore import Candidate
 from jaxid.discovery.likelihood import price, score, weights
 from jaxid.discovery.loose import undetermined, with_fewer, without_loose
 from jaxid.discovery.models import Model, Visited, probability
-from jaxid.discovery.score import Data
 from jaxid.discovery.search import Search, _lost
 from jaxid.discovery.signs import of_one_sign
 from jaxid.discovery.verify import Refits

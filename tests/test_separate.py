@@ -7,7 +7,8 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from jaxid.discovery.score import Data, Gram, chance
+from jaxid.discovery.data import Data
+from jaxid.discovery.score import Gram, chance
 from jaxid.discovery.separate import estimate_noise
 
 SAMPLES, DRAWS = 300, 80

@@ -20,9 +20,10 @@ from ..noise import ARFilter
 from ..parameters import write_values
 from ..storage.saved import save
 from .comparison import Comparison
+from .data import Data
 from .floor import Floor
 from .hypotheses import Hypothesis, amplitudes, on_recordings
-from .score import Data, Gram
+from .score import Gram
 from .separate import leftover
 
 if TYPE_CHECKING:

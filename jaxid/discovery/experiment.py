@@ -18,10 +18,11 @@ from ..recording import Recording
 from ..simulation.batch import prepare
 from ..simulation.loop import ClosedLoop
 from ..simulation.steps import with_substeps
+from .data import Data
 from .diagnosis import Diagnosis, Verdict
 from .hypotheses import effect_on
 from .linear import at_samples, base_columns, linearise, sampled
-from .score import Data, Gram
+from .score import Gram
 from .signatures import signatures
 
 if TYPE_CHECKING:

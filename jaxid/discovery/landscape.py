@@ -11,9 +11,10 @@ from ..effects import AbstractEffect, AbstractTransmission, Curve
 from ..noise import ARFilter
 from ..parameters import write_values
 from .bounded import bounded_amplitudes
+from .data import Data
 from .hypotheses import Hypothesis, amplitudes
 from .predict import Prediction, Predictor
-from .score import Data, Gram, Whitened, by_width, explained_by, spanned, strong_directions
+from .score import Gram, Whitened, by_width, explained_by, spanned, strong_directions
 from .system import System
 
 

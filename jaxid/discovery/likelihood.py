@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ..estimate import Fit
 from ..estimate.prior import prior_of
 from ..noise import ARFilter
-from .score import Data
+from .data import Data
 from .separate import filter_of
 
 # Largest order of a model's noise filters.

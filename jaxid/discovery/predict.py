@@ -20,10 +20,11 @@ from ..estimate.minimise import Filling, Stopping, Sums, descend
 from ..noise import ARFilter
 from ..parameters import Bounds, read_values, write_values
 from .bounded import least_squares
+from .data import Data
 from .finite import differences
 from .hypotheses import free_of
 from .linear import Place, at_samples, respond
-from .score import Data, spanned
+from .score import spanned
 from .signatures import force_and_slopes, torques_of
 from .system import System
 

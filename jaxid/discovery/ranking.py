@@ -12,12 +12,13 @@ from ..errors import FitError
 from ..estimate import Fit
 from .bounded import bounded_amplitudes
 from .comparison import Comparison
+from .data import Data
 from .diagnosis import Diagnosis, Verdict, share_left
 from .floor import floor_of
 from .hypotheses import Hypothesis
 from .likelihood import score
 from .linear import at_rows
-from .score import Data, Gram, chance, corrected, effective_tests
+from .score import Gram, chance, corrected, effective_tests
 from .separate import columns_of, estimate_noise, leftover
 from .system import System
 

@@ -18,11 +18,11 @@ from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..simulation.sharing import with_one_blas_thread
 from .comparison import Comparison
+from .data import Data
 from .diagnosis import Diagnosis
 from .hypotheses import Hypothesis, candidates, curves, survey
 from .linear import at_rows, at_samples
 from .ranking import Screened, judge
-from .score import Data
 from .signatures import signatures
 from .system import System
 

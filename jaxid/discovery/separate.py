@@ -8,15 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..noise import ARFilter, fit_ar
-from .score import (
-    Blocks,
-    Data,
-    Rows,
-    Whitened,
-    by_width,
-    explained_by,
-    strong_directions,
-)
+from .data import Data, Rows
+from .score import Blocks, Whitened, by_width, explained_by, strong_directions
 
 
 class Separated(eqx.Module):

@@ -19,8 +19,8 @@ from ..simulation.integration import SIGNALS
 from ..simulation.loop import ClosedLoop
 from ..simulation.steps import with_substeps
 from .comparison import Comparison
+from .data import Known
 from .linear import Linearised, at_samples, base_columns, linearise, sampled
-from .score import Known
 from .signatures import left_for_links
 
 

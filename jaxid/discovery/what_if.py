@@ -21,12 +21,13 @@ from ..parameters import Bounds, read_values, write_values
 from ..recording import Recording, Recordings
 from .bounded import least_squares
 from .comparison import Comparison, compare
+from .data import whitened
 from .diagnosis import over_recordings, share_left
 from .hypotheses import amplitudes, free_of
 from .landscape import form
 from .linear import at_rows
 from .predict import Prediction, Predictor
-from .score import spanned, whitened
+from .score import spanned
 from .screening import offered
 from .system import System
 from .verify import Refits

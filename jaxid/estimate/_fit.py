@@ -21,6 +21,7 @@ from ..simulation.sharing import with_one_blas_thread
 from .drawn import contradiction
 from .mistakes import LARGE_PERCENT, at_limit, likely_mistake
 from .oem import OEM, oem_of
+from .prior import drawing_note
 from .result import DOUBTFUL_PERCENT, AbstractMethod, Fit, Status
 from .standstill import raised, slow_note
 
@@ -71,7 +72,7 @@ def fit(
             break
         found = again
     found = _followed(_doubted(_examined(_without_nan(found), loop)))
-    notes = (*found.notes, *_matter(found), *_band(loop, recordings))
+    notes = (*found.notes, *_matter(found), *drawing_note(found), *_band(loop, recordings))
     notes = (*notes, *slow_note(given, found.loop), *_gaps(recordings))
     notes = (*notes, *_restarted(loop, recordings))
     return dataclasses.replace(found, notes=notes)

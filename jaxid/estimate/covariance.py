@@ -133,7 +133,7 @@ def covariance_of(
         meat = known + newey_west(reduced.residuals, jacobians)
     covariance, lost = determined_covariance(own + known, names, scales, meat)
     if problem.prior is not None and np.isfinite(own).all():
-        # A prior makes deviations finite, also where recordings say nothing.
+        # A prior makes all deviations finite. Named is what the recordings alone do not determine.
         lost = determined_covariance(own, names, scales)[1]
     return covariance, lost
 

@@ -7,6 +7,7 @@ from ..parameters import Parameter
 from ..recording import Recordings
 from ..simulation.loop import ClosedLoop
 from .minimise import Prior
+from .result import Fit
 
 
 def prior_of(loop: ClosedLoop, recordings: Recordings) -> Prior | None:
@@ -37,6 +38,32 @@ def prior_of(loop: ClosedLoop, recordings: Recordings) -> Prior | None:
         blocks.append(rows)
     rows = np.concatenate(blocks)
     return Prior(rows, expected) if len(rows) else None
+
+
+def drawing_note(found: Fit) -> list[str]:
+    """A note on base parameters that the drawing determines, and not the recordings.
+
+    **Arguments:**
+
+    - `found`: a fit of an arm whose base parameters may have a prior.
+    """
+    drawn, base = found.loop.arm.expected(), ("arm", "base")
+    names = [n for p in found.loop.free_parameters if p.place == base for n in p.names]
+    if drawn is None or not names:
+        return []
+    before = np.sqrt(np.diag(np.asarray(drawn[1])))
+    at = [found.names.index(name) for name in names]
+    same = [n for n, x, y in zip(names, found.std[at], before, strict=True) if x > _SAME * y]
+    if not same:
+        return []
+    return [
+        f"{len(same)} of {len(names)} base parameters are those of the drawing, because the "
+        f"recordings tell little of them: {', '.join(same)}"
+    ]
+
+
+# Ratio of the deviations after and before the recordings, from which a value is the drawing's.
+_SAME = 0.7
 
 
 def _likely(

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..discovery import Comparison
+from ..discovery.data import whitened
 from ..discovery.diagnosis import Verdict
-from ..discovery.score import whitened
 from ..display import figures
 from ..effects import Curve
 from ..effects.curve import coordinate_unit

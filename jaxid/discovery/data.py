@@ -1,0 +1,204 @@
+"""Residual and sensitivities of a fit at its samples, and their whitening."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..errors import FitError
+from ..noise import ARFilter
+
+Rows = Float[np.ndarray, "recordings samples outputs"]
+
+
+def places_among(numbers: Sequence[int], kept: tuple[int, ...] | None) -> list[int]:
+    """Places of columns among those that were kept; `kept` is None if all were.
+
+    **Raises:** `FitError` if they were not kept.
+    """
+    if kept is None:
+        return list(numbers)
+    if not set(numbers) <= set(kept):
+        raise FitError(
+            "a story keeps only the signatures of its rankings: use jaxid.diagnose(step.fit) for "
+            "all signatures"
+        )
+    return [kept.index(number) for number in numbers]
+
+
+class Known(eqx.Module):
+    """What is known of the base's values before the recordings, as rows of deviation one.
+
+    - `rows`: derivatives by the values. `left`: expected minus fitted values, in deviations.
+    """
+
+    rows: Float[np.ndarray, "known absorbed"]
+    left: Float[np.ndarray, " known"]
+
+
+class Data(eqx.Module):
+    """Residual and sensitivities at the samples; zero for padding.
+
+    `base` has the columns that the model's own parameters and initial states can absorb, `table`
+    the signatures; `mask` is false for padding. Signatures are in single precision: there are many,
+    and three digits suffice. `level` is the noise level of each recording relative to the mean;
+    None if all are equal. `kept` are the numbers of the columns in the table; None for all columns.
+    `known` is what is known of the base's values; None if that is nothing.
+    """
+
+    residual: Rows
+    base: Float[np.ndarray, "recordings samples outputs absorbed"]
+    table: Float[np.ndarray, "recordings samples outputs columns"]
+    mask: Bool[np.ndarray, "recordings samples"]
+    level: Float[np.ndarray, "recordings outputs"] | None = None
+    kept: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    known: Known | None = None
+
+    def columns(
+        self, numbers: Sequence[int]
+    ) -> Float[np.ndarray, "recordings samples outputs columns"]:
+        """Signatures by their numbers.
+
+        **Raises:** `FitError` if they have not been kept.
+        """
+        return self.table[..., places_among(numbers, self.kept)]
+
+    def only(self, numbers: Sequence[int]) -> "Data":
+        """The same with only these columns of the table."""
+        return dataclasses.replace(self, table=self.columns(numbers), kept=tuple(numbers))
+
+    def series(self, rows: Rows, output: int) -> list[np.ndarray]:
+        """One output's rows, one series per recording, scaled to a common noise level."""
+        alike = np.ones((len(rows), rows.shape[2])) if self.level is None else self.level
+        pairs = zip(rows, self.mask, alike[:, output], strict=True)
+        return [r[m, output] / level for r, m, level in pairs]
+
+    def white(
+        self, x: Float[np.ndarray, "recordings samples outputs *columns"], noise: Sequence[ARFilter]
+    ) -> Float[np.ndarray, "recordings samples outputs *columns"]:
+        """Rows through the inverse of the noise filters, scaled to a common noise level."""
+        out = whitened(x, noise, self.mask)
+        if self.level is not None:
+            level = self.level.astype(x.dtype)[:, None]
+            out /= level.reshape(*level.shape, *(1,) * (x.ndim - 3))
+        return out
+
+    def white_residual(
+        self,
+        rest: Rows,
+        noise: Sequence[ARFilter],
+        taken: Float[np.ndarray, " absorbed"] | None = None,
+    ) -> Float[np.ndarray, " rows"]:
+        """A whitened residual, and below it what is left of the knowledge of the base's values.
+
+        **Arguments:**
+
+        - `taken`: changes of the base's values; none if None.
+        """
+        rows = self.white(rest, noise).reshape(-1)
+        return rows if self.known is None else np.append(rows, self.known_left(taken))
+
+    def white_columns(
+        self,
+        x: Float[np.ndarray, "recordings samples outputs columns"],
+        noise: Sequence[ARFilter],
+        base: Sequence[int] | slice | None = None,
+    ) -> Float[np.ndarray, "rows columns"]:
+        """Whitened columns, and below them their derivatives of what is known.
+
+        **Arguments:**
+
+        - `base`: places in the base of the first columns; the others are not known. None if no
+          column belongs to the base.
+        """
+        rows = self.white(x, noise).reshape(-1, x.shape[-1])
+        if self.known is None:
+            return rows
+        own = self.known.rows[:, slice(0) if base is None else base]
+        below = np.pad(own, ((0, 0), (0, x.shape[-1] - own.shape[1])))
+        return np.concatenate([rows, below.astype(rows.dtype)])
+
+    def known_left(
+        self, taken: Float[np.ndarray, " absorbed"] | None = None
+    ) -> Float[np.ndarray, " known"]:
+        """Expected minus estimated values of the base in deviations; empty if nothing is known.
+
+        **Arguments:** as for `white_residual`.
+        """
+        if self.known is None:
+            return np.zeros(0)
+        return self.known.left if taken is None else self.known.left - self.known.rows @ taken
+
+    def middle(self, most: int, least: int = 1000) -> "Data":
+        """The middle of each recording, with at most `most` rows in total.
+
+        **Arguments:**
+
+        - `least`: number of samples of each recording that are always kept. Otherwise short pieces
+          would have almost no samples after their noise filter is filled.
+        """
+        recordings, samples, outputs = self.residual.shape
+        length = max(least, most // (recordings * outputs))
+        if length >= samples:
+            return self
+        spare = np.maximum(self.mask.sum(axis=1) - length, 0)
+        first = np.minimum(np.argmax(self.mask, axis=1) + spare // 2, samples - length)
+
+        def cut(rows: np.ndarray) -> np.ndarray:
+            return np.stack([r[at : at + length] for r, at in zip(rows, first, strict=True)])
+
+        return dataclasses.replace(
+            self,
+            residual=cut(self.residual),
+            base=cut(self.base),
+            table=cut(self.table),
+            mask=cut(self.mask),
+        )
+
+
+def whitened(
+    x: Float[np.ndarray, "recordings samples outputs *columns"],
+    noise: Sequence[ARFilter],
+    mask: Bool[np.ndarray, "recordings samples"],
+) -> Float[np.ndarray, "recordings samples outputs *columns"]:
+    """Each output through its noise filter's inverse and over its innovations' deviation."""
+    out = np.empty_like(x)
+    for j, filt in enumerate(noise):
+        level = np.sqrt(filt.variance) if filt.variance > 0 else 1.0
+        taps = (filt.polynomial / level).astype(x.dtype)
+        for k, there in enumerate(mask):
+            wide = x[k, :, j].reshape(x.shape[1], -1)
+            out[k, :, j] = _through(taps, wide).reshape(out[k, :, j].shape)
+            # The past of the first samples is unknown. With zeros the first rows would be outliers,
+            # which any signature that starts with a step could explain.
+            out[k, : int(np.argmax(there)) + filt.order, j] = 0.0
+    out[~mask] = 0.0
+    return out
+
+
+def _through(
+    taps: Float[np.ndarray, " taps"], x: Float[np.ndarray, "samples columns"]
+) -> Float[np.ndarray, "samples columns"]:
+    """Moving average along the samples, as products with one banded matrix; zero before the first.
+
+    SciPy's `lfilter` needs one convolution per column and is five times as slow for a thousand.
+    """
+    import scipy
+
+    reach = int(np.flatnonzero(taps).max(initial=0))
+    if reach == 0:
+        return taps[0] * x
+    # Of a band as wide as it is high half is zeros; a lower one would be too many products.
+    size, taps = max(32, reach), taps[: reach + 1]
+    row = np.concatenate([taps[::-1], np.zeros(size - 1, taps.dtype)])
+    band = scipy.linalg.toeplitz(np.concatenate([taps[-1:], np.zeros(size - 1, taps.dtype)]), row)
+    out = np.empty_like(x)
+    for at in range(0, len(x), size):
+        first = max(at - reach, 0)
+        piece = x[first : at + size]
+        missing = first - (at - reach)
+        rows = min(size, len(x) - at)
+        out[at : at + size] = band[:rows, missing : missing + len(piece)] @ piece
+    return out
