@@ -9,9 +9,9 @@ import pytest
 
 import jaxid
 from jaxid.arms import SerialArm, physical_bodies
-from jaxid.arms.physical import smallest_eigenvalues
+from jaxid.arms.physical import chance_of, smallest_eigenvalues
 from jaxid.errors import ModelError
-from tests.test_serial import SHARED, pinocchio_of
+from tests.test_serial import POLAR, SHARED, pinocchio_of
 from tests.test_serial import described as described
 
 INVERSE = eqx.filter_jit(lambda arm, q, v, a: arm.inverse(q, v, a))
@@ -102,6 +102,30 @@ def test_base_parameters_that_no_body_has_are_told_and_moved_to_the_nearest(desc
     assert smallest_eigenvalues(found.bodies).min() > 0
     nearest = dataclasses.replace(arm, base=jnp.asarray(found.base))
     assert physical_bodies(nearest, sure).distance < 1
+    assert chance_of(wrong, sure, found, draws=19) == 1 / 20
+
+
+def test_a_small_probability_of_physical_bodies_is_rare(tmp_path):
+    """Estimates of bodies at the limit of what is physical, the hardest case."""
+    path = tmp_path / "polar.urdf"
+    path.write_text(POLAR)
+    arm = SerialArm.from_urdf(path)
+    base = np.asarray(arm.base)
+    sure = np.diag((0.1 * np.maximum(np.abs(base), 0.1 * np.abs(base).max())) ** 2)
+
+    def estimated(values):
+        estimate = dataclasses.replace(arm, base=jnp.asarray(values))
+        return estimate, physical_bodies(estimate, sure)
+
+    _, limit = estimated(np.where(base == base[0], -base, base))
+    assert limit.distance > 5
+    rng, small = np.random.default_rng(2), 0
+    for _ in range(30):
+        noise = np.sqrt(np.diag(sure)) * rng.standard_normal(len(base))
+        estimate, found = estimated(limit.base + noise)
+        small += found.distance > 0 and chance_of(estimate, sure, found, draws=9) <= 0.1
+    # Three are expected.
+    assert small <= 7
 
 
 def test_only_arms_in_space_are_written_and_only_to_their_own_urdf(described, tmp_path):

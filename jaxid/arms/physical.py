@@ -1,5 +1,7 @@
 """Physically consistent bodies for estimated base parameters."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -63,17 +65,8 @@ def physical_bodies(
     else:
         values, vectors = np.linalg.eigh(covariance)
         whiten = (vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T
-    unknown = cvxpy.Variable(drawn.size)
-    bodies = cvxpy.multiply(scale.ravel(), unknown)
-    matter = [
-        _pseudo_inertia(cvxpy, unknown[10 * k : 10 * (k + 1)]) >> _LEAST * np.eye(4)
-        for k in range(arm.joints)
-    ]
-    away = whiten @ (combined @ bodies - base)
-    size = np.linalg.norm(whiten @ base)
-    _solved(cvxpy, cvxpy.norm(away / size), matter)
-    distance = size * float(np.linalg.norm(np.asarray(away.value) / size))
-    distance = float(distance) if distance > _THERE else 0.0
+    unknown, bodies, matter = _physical(cvxpy, arm)
+    distance = _distances(cvxpy, arm, whiten, bodies, matter)(base)
     reached = base if distance == 0 else combined @ np.asarray(bodies.value)
     # Among all bodies with these base parameters, those most like the drawing.
     told = np.linalg.norm(combined, axis=1) * np.abs(scale).max()
@@ -88,6 +81,65 @@ def physical_bodies(
     if smallest_eigenvalues((found + rest).reshape(drawn.shape)).min() > 0:
         found = found + rest
     return PhysicalBodies(found.reshape(drawn.shape), combined @ found, distance)
+
+
+def chance_of(
+    arm: SerialArm,
+    covariance: Float[np.ndarray, "base base"],
+    found: PhysicalBodies,
+    draws: int = 99,
+) -> float:
+    """Probability that estimates of physical bodies are as far from any as an arm's parameters.
+
+    The distance of estimates has no closed distribution: it is drawn, with the nearest physical
+    bodies as the true ones (Monte Carlo test, Barnard 1963). Drawing ends with the first distance
+    that is larger, because the probability is then above 1 / (`draws` + 1).
+
+    **Arguments:**
+
+    - `arm`, `covariance`: as for `physical_bodies`. `found`: its result.
+    - `draws`: largest number of draws.
+    """
+    cvxpy = require("cvxpy", "sdp")
+    values, vectors = np.linalg.eigh(covariance)
+    deviations = np.sqrt(np.maximum(values, 1e-12 * values.max()))
+    _, bodies, matter = _physical(cvxpy, arm)
+    distance = _distances(cvxpy, arm, (vectors / deviations).T, bodies, matter)
+    rng = np.random.default_rng(0)
+    for k in range(1, draws + 1):
+        if distance(found.base + vectors @ (deviations * rng.standard_normal(len(values)))) >= (
+            found.distance
+        ):
+            return 2 / (k + 1)
+    return 1 / (draws + 1)
+
+
+def _physical(cvxpy, arm: SerialArm):
+    """Unknowns in units of `_scales`, the bodies, and the constraints that they are physical."""
+    unknown = cvxpy.Variable(10 * arm.joints)
+    matter = [
+        _pseudo_inertia(cvxpy, unknown[10 * k : 10 * (k + 1)]) >> _LEAST * np.eye(4)
+        for k in range(arm.joints)
+    ]
+    return unknown, cvxpy.multiply(_scales(arm).ravel(), unknown), matter
+
+
+def _distances(
+    cvxpy, arm: SerialArm, whiten: Float[np.ndarray, "base base"], bodies, matter
+) -> Callable[[Float[np.ndarray, " base"]], float]:
+    """The function from base parameters to their distance from physical bodies, in deviations."""
+    size = float(np.linalg.norm(whiten @ np.asarray(arm.base)))
+    target = cvxpy.Parameter(len(whiten))
+    away = (whiten @ np.asarray(arm.combined) / size) @ bodies - target
+    problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.norm(away)), matter)
+
+    def distance(base: Float[np.ndarray, " base"]) -> float:
+        target.value = whiten @ base / size
+        _solve(cvxpy, problem)
+        found = size * float(np.linalg.norm(np.asarray(away.value)))
+        return found if found > _THERE else 0.0
+
+    return distance
 
 
 def smallest_eigenvalues(bodies: Float[np.ndarray, "joints 10"]) -> Float[np.ndarray, " joints"]:
@@ -118,7 +170,10 @@ def _scales(arm: SerialArm) -> Float[np.ndarray, "joints 10"]:
 
 
 def _solved(cvxpy, objective, constraints) -> None:
-    problem = cvxpy.Problem(cvxpy.Minimize(objective), constraints)
+    _solve(cvxpy, cvxpy.Problem(cvxpy.Minimize(objective), constraints))
+
+
+def _solve(cvxpy, problem) -> None:
     try:
         problem.solve(solver="CLARABEL")
     except cvxpy.SolverError as error:

@@ -1,7 +1,6 @@
 """`fit`, the entry point of all methods."""
 
 import dataclasses
-import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..arms import SerialArm, physical_bodies
+from ..arms.physical import chance_of
 from ..control import Reading, Sampled
 from ..effects import AbstractEffect, AbstractTransmission, check_declared
 from ..errors import FitError, MissingExtraError, ModelError
@@ -89,8 +89,9 @@ def _check_rigid(loop: ClosedLoop, method: AbstractMethod) -> None:
             )
 
 
-# The note needs a distance to physical bodies that has at most this probability by chance.
-_CHANCE = 0.01
+# The note needs a distance to physical bodies that has at most this probability by chance. Even one
+# degree of freedom gives a larger one than the second number.
+_CHANCE, _FAR = 0.01, 2.6
 
 
 def _matter(found: Fit) -> list[str]:
@@ -110,10 +111,7 @@ def _matter(found: Fit) -> list[str]:
         nearest = physical_bodies(arm, covariance)
     except (MissingExtraError, ModelError):
         return []
-    import scipy
-
-    limit = math.sqrt(scipy.stats.chi2.isf(_CHANCE, len(at)))
-    if nearest.distance < limit:
+    if nearest.distance < _FAR or chance_of(arm, covariance, nearest) > _CHANCE:
         return []
     moved = np.abs(nearest.base - np.asarray(arm.base)) / np.sqrt(np.diag(covariance))
     worst = names[0][int(np.argmax(moved))]

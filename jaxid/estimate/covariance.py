@@ -179,8 +179,9 @@ def score_covariance(
     - `information`: J'J, with that of a prior.
     """
     outputs, p = jacobians[0].shape[1:]
-    size = np.sqrt(np.diag(information))
-    units = np.outer(*[np.where(size > 0, size, 1.0)] * 2)
+    length = np.sqrt(np.diag(information))
+    length = np.where(length > 0, length, 1.0)
+    units = np.outer(length, length)
     meat, inverse = np.zeros((p, p)), np.linalg.pinv(information / units, hermitian=True) / units
     for o in range(outputs):
         series = [r[:, o] - r[:, o].mean() for r in residuals]
