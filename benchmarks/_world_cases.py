@@ -192,9 +192,9 @@ def _recorded(
 ) -> dict[str, np.ndarray]:
     """The logged run: at `rate`, with noise in the torque.
 
-    `folded` is the part of the logged torque, without noise, that is due to frequencies too high
-    for `rate`: a law on encoder steps has a broad spectrum, which a logger without a filter folds
-    into all frequencies.
+    `aliased` is the part of the logged torque, without noise, that is due to frequencies too high
+    for `rate`: a law on encoder steps has a broad spectrum, of which a logger without an
+    anti-aliasing filter takes samples.
     """
     every = 1000 // rate
     tau = run.tau[::every]
@@ -207,7 +207,7 @@ def _recorded(
         "tau": tau + errors,
         "q_ref": run.q_ref[::every],
         "noise": errors,
-        "folded": tau - resolved,
+        "aliased": tau - resolved,
     }
 
 
@@ -228,10 +228,10 @@ def _noise(rng: np.random.Generator, shape: tuple[int, ...], kind: str) -> np.nd
 def unexplained(signals: dict[str, np.ndarray], law: str) -> np.ndarray:
     """The part of a recorded torque that no model explains, `(samples, joints)`, N·m or N.
 
-    Without the law, a model has the torque along the recorded motion, and not what the logger
-    folds into its frequencies. A simulation of the law has both.
+    Without the law, a model has the torque along the recorded motion, and not its aliases. A
+    simulation of the law has both.
     """
-    return signals["noise"] + (signals["folded"] if law == "unknown" else 0.0)
+    return signals["noise"] + (signals["aliased"] if law == "unknown" else 0.0)
 
 
 def start_model(case: Case, law: str) -> jaxid.ClosedLoop:

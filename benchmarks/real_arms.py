@@ -1,8 +1,9 @@
 """Measured six-joint arms: rigid models, models with the missing effect, and `discover`.
 
-KUKA KR300 (Weigand et al. 2021): bodies as drawn, fitted on recording A, tested on B; the model
-lacks the counterbalance at joint 2. Stäubli TX40 (FIGAROH): fitted on the first 5 s, tested on the
-remaining time; the model lacks the shaft that joints 5 and 6 share.
+KUKA KR300 (Weigand et al. 2021): fitted on recording A, tested on B; the model with bodies as drawn
+lacks the counterbalance at joint 2. Bodies near the drawing, and free, for comparison. Stäubli TX40
+(FIGAROH): fitted on the first 5 s, tested on the remaining time; the model lacks the shaft that
+joints 5 and 6 share.
 
 python -m benchmarks.real_arms [--quick] [--json FILE]
 """

@@ -269,7 +269,7 @@ def test_evidence_leaves_hand_written_text_and_draws_the_curves(tmp_path):
         evidence.main([str(file), "--page", str(page)])
 
 
-def test_worlds_tell_what_a_logger_folds_into_its_frequencies():
+def test_worlds_tell_what_a_logger_aliases():
     """A line above half the logger's rate appears at their difference, and belongs to the noise."""
     if not (ROOT / "benchmarks").is_dir():
         pytest.skip("no benchmarks beside the tests: they are part of a checkout alone")
@@ -283,8 +283,8 @@ def test_worlds_tell_what_a_logger_folds_into_its_frequencies():
     seen = _recorded(np.random.default_rng(1), run, 250, np.array([0.01]), "white")
     middle = slice(500, -500)
     expected = (chatter[::4])[middle]
-    np.testing.assert_allclose(seen["folded"][middle, 0], expected, atol=1e-4)
-    line = np.abs(np.fft.rfft(seen["folded"][middle, 0]))
+    np.testing.assert_allclose(seen["aliased"][middle, 0], expected, atol=1e-4)
+    line = np.abs(np.fft.rfft(seen["aliased"][middle, 0]))
     assert np.fft.rfftfreq(len(expected), 1 / 250)[np.argmax(line)] == pytest.approx(55, abs=0.1)
     left = seen["tau"] - motion[::4, None] - unexplained(seen, "unknown")
     assert abs(left[middle]).max() < 1e-4

@@ -11,6 +11,9 @@ from ..parameters import Scalar, Vector, as_float64, parameter
 from ._base import AbstractEffect, Motion, on_joint
 from ._scene import Scene
 
+# Standard deviation of an offset before any recording, relative to the recorded torque.
+_LIKELY = 0.1
+
 
 class TorqueRipple(AbstractEffect):
     """Cogging and gear ripple: A cos(n q) + B sin(n q), n unknown."""
@@ -39,10 +42,6 @@ class TorqueRipple(AbstractEffect):
         angle = self.harmonic * motion.q[self.joint - 1]
         wave = self.A * jnp.cos(angle) + self.B * jnp.sin(angle)
         return on_joint(self.joint, wave, motion)
-
-
-# Standard deviation of an offset before any recording, relative to the recorded torque.
-_LIKELY = 0.1
 
 
 class TorqueOffset(AbstractEffect):
