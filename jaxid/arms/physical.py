@@ -63,8 +63,8 @@ def physical_bodies(
     if covariance is None:
         whiten = np.diag(1 / np.maximum(np.abs(base), 1e-3 * np.abs(base).max()))
     else:
-        values, vectors = np.linalg.eigh(covariance)
-        whiten = (vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T
+        deviations, vectors = _axes(covariance)
+        whiten = (vectors / deviations).T
     unknown, bodies, matter = _physical(cvxpy, arm)
     distance = _distances(cvxpy, arm, whiten, bodies, matter)(base)
     reached = base if distance == 0 else combined @ np.asarray(bodies.value)
@@ -101,17 +101,23 @@ def chance_of(
     - `draws`: largest number of draws.
     """
     cvxpy = require("cvxpy", "sdp")
-    values, vectors = np.linalg.eigh(covariance)
-    deviations = np.sqrt(np.maximum(values, 1e-12 * values.max()))
+    deviations, vectors = _axes(covariance)
     _, bodies, matter = _physical(cvxpy, arm)
     distance = _distances(cvxpy, arm, (vectors / deviations).T, bodies, matter)
     rng = np.random.default_rng(0)
     for k in range(1, draws + 1):
-        if distance(found.base + vectors @ (deviations * rng.standard_normal(len(values)))) >= (
-            found.distance
-        ):
+        error = vectors @ (deviations * rng.standard_normal(len(deviations)))
+        if distance(found.base + error) >= found.distance:
             return 2 / (k + 1)
     return 1 / (draws + 1)
+
+
+def _axes(
+    covariance: Float[np.ndarray, "base base"],
+) -> tuple[Float[np.ndarray, " base"], Float[np.ndarray, "base base"]]:
+    """Deviations along the eigenvectors of a covariance, and these eigenvectors."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.sqrt(np.maximum(values, 1e-12 * values.max())), vectors
 
 
 def _physical(cvxpy, arm: SerialArm):

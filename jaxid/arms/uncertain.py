@@ -36,7 +36,8 @@ def drawn_covariance(
         deviation[:, unit] = np.maximum(part, _LEAST * part.max())
     within = combined * (uncertainty * deviation.ravel())
     covariance = within @ within.T
-    rotors = arm.rotors_in_base()
+    # It needs a regressor at many poses.
+    rotors = arm.rotors_in_base() if unknown_rotors else np.zeros((len(combined), 0))
     for joint in unknown_rotors:
         column = rotors[:, joint - 1] * _UNKNOWN * np.abs(np.asarray(arm.base)).max()
         covariance = covariance + np.outer(column, column)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..errors import FitError
+from ..estimate.minimise import Prior
 from ..noise import ARFilter
 
 Rows = Float[np.ndarray, "recordings samples outputs"]
@@ -28,16 +29,6 @@ def places_among(numbers: Sequence[int], kept: tuple[int, ...] | None) -> list[i
     return [kept.index(number) for number in numbers]
 
 
-class Known(eqx.Module):
-    """What is known of the base's values before the recordings, as rows of deviation one.
-
-    - `rows`: derivatives by the values. `left`: expected minus fitted values, in deviations.
-    """
-
-    rows: Float[np.ndarray, "known absorbed"]
-    left: Float[np.ndarray, " known"]
-
-
 class Data(eqx.Module):
     """Residual and sensitivities at the samples; zero for padding.
 
@@ -45,7 +36,7 @@ class Data(eqx.Module):
     the signatures; `mask` is false for padding. Signatures are in single precision: there are many,
     and three digits suffice. `level` is the noise level of each recording relative to the mean;
     None if all are equal. `kept` are the numbers of the columns in the table; None for all columns.
-    `known` is what is known of the base's values; None if that is nothing.
+    `known` is the prior of changes of the base's values; None if nothing is known of them.
     """
 
     residual: Rows
@@ -54,7 +45,7 @@ class Data(eqx.Module):
     mask: Bool[np.ndarray, "recordings samples"]
     level: Float[np.ndarray, "recordings outputs"] | None = None
     kept: tuple[int, ...] | None = eqx.field(static=True, default=None)
-    known: Known | None = None
+    known: Prior | None = None
 
     def columns(
         self, numbers: Sequence[int]
@@ -129,7 +120,7 @@ class Data(eqx.Module):
         """
         if self.known is None:
             return np.zeros(0)
-        return self.known.left if taken is None else self.known.left - self.known.rows @ taken
+        return self.known.left(np.zeros(self.known.rows.shape[1]) if taken is None else taken)
 
     def middle(self, most: int, least: int = 1000) -> "Data":
         """The middle of each recording, with at most `most` rows in total.

@@ -19,7 +19,6 @@ from ..simulation.integration import SIGNALS
 from ..simulation.loop import ClosedLoop
 from ..simulation.steps import with_substeps
 from .comparison import Comparison
-from .data import Known
 from .linear import Linearised, at_samples, base_columns, linearise, sampled
 from .signatures import left_for_links
 
@@ -65,13 +64,14 @@ class System(eqx.Module):
         return cls(loop, advanced(batch, loop), linear, left, residual, base, row, prior)
 
     @property
-    def known(self) -> Known | None:
-        """The rows of the prior for the columns of the base."""
+    def known(self) -> Prior | None:
+        """The prior of changes of the base's values; of initial states nothing is known."""
         if self.prior is None:
             return None
-        rows = np.asarray(self.prior.rows)
-        rows = np.pad(rows, ((0, 0), (0, self.base.shape[-1] - rows.shape[1])))
-        return Known(rows, np.asarray(self.prior.left(np.asarray(self.loop.theta))))
+        rows, expected = np.asarray(self.prior.rows), np.asarray(self.prior.expected)
+        more = self.base.shape[-1] - len(expected)
+        changes = expected - np.asarray(self.loop.theta)
+        return Prior(np.pad(rows, ((0, 0), (0, more))), np.pad(changes, (0, more)))
 
     @property
     def mask(self) -> Bool[np.ndarray, "recordings samples"]:

@@ -109,9 +109,9 @@ def _matter(found: Fit) -> list[str]:
         return []
     try:
         nearest = physical_bodies(arm, covariance)
+        if nearest.distance < _FAR or chance_of(arm, covariance, nearest) > _CHANCE:
+            return []
     except (MissingExtraError, ModelError):
-        return []
-    if nearest.distance < _FAR or chance_of(arm, covariance, nearest) > _CHANCE:
         return []
     moved = np.abs(nearest.base - np.asarray(arm.base)) / np.sqrt(np.diag(covariance))
     worst = names[0][int(np.argmax(moved))]
