@@ -102,9 +102,10 @@ class WithinIntervals(diffrax.AbstractSolver):
 
 
 class ThroughIntervals(diffrax.AbstractSolver):
-    """RK4 whose step is a whole interval; the loop's inputs are looked up once per interval.
+    """One of jaxid's own methods, whose step is a whole interval.
 
-    Within an interval time is in seconds, and the state is split into rows if `split`.
+    The loop's inputs are looked up once per interval. Within an interval time is in seconds, and
+    the state is split into rows if `split`.
     """
 
     method: Any

@@ -31,7 +31,9 @@ from .by_interval import (
     together,
 )
 from .dynamics import Instant, Outside, imposed, instant, reading
+from .exponential import Exponential
 from .loop import ClosedLoop
+from .pruning import pruned
 from .state import State, behind, rest, settle, unflatten
 from .stepping import ready
 from .unrolling import unrolled
@@ -131,8 +133,6 @@ def _rate(loop: ClosedLoop, intervals: Interval, x: Float[Array, " states"]) -> 
 
     if loop.stepping.batched:
         return whole
-    if imposed(loop):
-        return rate
     first = one_of(intervals, jnp.asarray(0))
     return unrolled(rate, first, first.t0, tuple(x))
 
@@ -175,13 +175,15 @@ def _solve(
     def field(t, y, window):
         window = window.at(t)
         now = one_of(window.intervals, jnp.asarray(0))
-        slope = together(rate(now, now.t0 + (t - window.first) * now.h, apart(y)), y)
+        at = now.t0 + (t - window.first) * now.h
+        slope = together(rate(now, at, apart(y)), y) if stepping.unrolled else rate(now, at, y)
         return jax.tree.map(lambda leaf: now.h * leaf, slope)
 
     made_jump, most = None, count
     control = stepping.control
     if stepping.plain:
-        solver, steps = ThroughIntervals(stepping.solver, rate, substeps), OneStep()
+        method = ThroughIntervals(stepping.solver, rate, substeps, stepping.unrolled)
+        solver, steps = method, OneStep()
     elif control is None:
         solver, steps = WithinIntervals(ready(stepping)), EqualSteps(substeps)
         made_jump, most = True, substeps * count if isinstance(substeps, int) else None
@@ -223,8 +225,8 @@ def integrate(
     - `intervals`: between grid points; the last one has zero length and ends the run.
     - `substeps`: replaces the number in the settings; a traced value serves any number.
     """
-    if given(loop):
-        return states_of_reference(loop, intervals, x0), success()
+    if imposed(loop):
+        return _along_reference(loop, intervals, x0, substeps), success()
     through = jax.tree.map(lambda leaf: leaf[:-1], intervals)
     rate = _rate(loop, through, x0)
     if loop.stepping.plain:
@@ -235,22 +237,49 @@ def integrate(
     return solution.ys, _number(solution.result)
 
 
-def given(loop: ClosedLoop) -> bool:
-    """Whether the recordings give all states, which leaves nothing to integrate."""
-    return imposed(loop) and not any(effect.initial_state().size for effect in loop.effects)
-
-
-def states_of_reference(
-    loop: ClosedLoop, intervals: Interval, x0: Float[Array, " states"]
+def _along_reference(
+    loop: ClosedLoop,
+    intervals: Interval,
+    x0: Float[Array, " states"],
+    substeps: int | Int[Array, ""] | None,
 ) -> Float[Array, "points states"]:
-    """The states at grid points where the reference is the motion."""
+    """The states at grid points where the reference is the motion.
 
-    def at(interval: Interval) -> Float[Array, " states"]:
+    Only the effects' own states are integrated.
+    """
+    unravel, count = unflatten(loop), intervals.h.shape[0]
+    own = unravel(x0).effects
+    if any(state.size for state in own):
+        through = jax.tree.map(lambda leaf: leaf[:-1], intervals)
+        rates = _rates_of_effects(loop, one_of(through, jnp.asarray(0)), x0)
+        own = _at_steps(_for_effects(loop), rates, through, own, substeps)
+    else:
+        own = jax.tree.map(lambda state: jnp.zeros((count, 0)), own)
+
+    def at(interval: Interval, own: tuple[Float[Array, " _"], ...]) -> Float[Array, " states"]:
         now = _reference(interval, jnp.zeros(()))
         q, v = behind(loop, now.q, now.v)
-        return ravel_pytree(dataclasses.replace(unflatten(loop)(x0), q=q, v=v))[0]
+        return ravel_pytree(dataclasses.replace(unravel(x0), q=q, v=v, effects=own))[0]
 
-    return jax.vmap(at)(intervals)
+    return jax.vmap(at)(intervals, own)
+
+
+def _for_effects(loop: ClosedLoop) -> ClosedLoop:
+    """The loop with the method for its effects' own states along an imposed motion."""
+    stepping = dataclasses.replace(loop.stepping, solver=Exponential(), control=None)
+    return dataclasses.replace(loop, stepping=stepping)
+
+
+def _rates_of_effects(loop: ClosedLoop, interval: Interval, x: Float[Array, " states"]) -> Rate:
+    """Rates of the effects' own states along an imposed motion, 1/s; otherwise as `_rate`."""
+    state = unflatten(loop)(x)
+
+    def rates(interval: Interval, t: Float[Array, ""], own: tuple[Float[Array, " _"], ...]):
+        at = dataclasses.replace(state, effects=own)
+        return instant_at(loop, interval, t, at).derivative.effects
+
+    # Hardly any of them depends on the torque of the arm.
+    return pruned(rates, interval, interval.t0, state.effects)
 
 
 def integrate_with_tangents(
@@ -297,16 +326,17 @@ def through_interval(
 
     - `alive`: False if there is nothing left to solve.
     """
-    if given(loop):
-        return x, success()
     alone = jax.tree.map(lambda leaf: leaf[None], interval)
+    if imposed(loop):
+        state = unflatten(loop)(x)
+        if not any(own.size for own in state.effects):
+            return x, success()
+        rates = _rates_of_effects(loop, interval, x)
+        own = _one_step(_for_effects(loop), rates, alone, state.effects, substeps)
+        return ravel_pytree(dataclasses.replace(state, effects=own))[0], success()
     rate = _rate(loop, alone, x)
     if loop.stepping.plain:
-        # One step cannot fail; a solve around it would only lengthen the compilation.
-        count = _substeps(loop, substeps)
-        solver = ThroughIntervals(loop.stepping.solver, rate, count, not loop.stepping.batched)
-        start = jnp.zeros(())
-        return solver.step(None, start, start + 1, x, Window(alone), None, False)[0], success()
+        return _one_step(loop, rate, alone, x, substeps), success()
     stop = None
     if alive is not None and loop.stepping.control is not None:
         stop = jnp.where(alive, 1.0, 0.0)
@@ -314,6 +344,16 @@ def through_interval(
     code = _number(solution.result)
     assert solution.ys is not None
     return jnp.where(code == 0, solution.ys[0], jnp.nan), code
+
+
+def _one_step(loop, rate, alone, y, substeps):
+    """A state at the end of an interval, by one of jaxid's own methods.
+
+    The step cannot fail; a solve around it would only lengthen the compilation.
+    """
+    stepping, start = loop.stepping, jnp.zeros(())
+    solver = ThroughIntervals(stepping.solver, rate, _substeps(loop, substeps), stepping.unrolled)
+    return solver.step(None, start, start + 1, y, Window(alone), None, False)[0]
 
 
 def _substeps(loop: ClosedLoop, given: int | Int[Array, ""] | None) -> int | Int[Array, ""]:

@@ -17,7 +17,6 @@ from ..signals.standstill import Standstill
 from .batch import Batch, Interval, check_law, prepare
 from .dynamics import imposed
 from .integration import (
-    given,
     initial,
     integrate,
     integrate_with_tangents,
@@ -197,7 +196,7 @@ def run_with_sensitivities(
     if with_batches(loop).stepping.batched:
         return _in_batches(loop, intervals, x0, start, rows)
     loop, columns = with_rolled_stages(loop), start.shape[1]
-    if loop.stepping.plain and loop.controller.period is None and not given(loop):
+    if loop.stepping.plain and loop.controller.period is None and not imposed(loop):
         states, tangents = integrate_with_tangents(loop, intervals, x0, start)
 
         def at(interval, x, tangents):

@@ -11,6 +11,7 @@ import optimistix
 from jaxtyping import PyTree
 
 from ..errors import ModelError
+from .exponential import Exponential
 
 
 class RK4(diffrax.AbstractSolver):
@@ -74,7 +75,8 @@ class Stepping(eqx.Module):
 
     Every diffrax solver that takes an ordinary differential equation as one term can be used, with
     fixed steps or with a step-size controller. Steps always end at samples, where the interpolated
-    reference may have a kink or a jump.
+    reference may have a kink or a jump. Along a recorded motion only states of effects are
+    integrated, always by fixed steps of an exponential method.
 
     **Arguments:**
 
@@ -130,8 +132,13 @@ class Stepping(eqx.Module):
 
     @property
     def plain(self) -> bool:
-        """Whether it is jaxid's own method with fixed steps, for which loops are unrolled."""
-        return isinstance(self.solver, RK4) and self.control is None
+        """Whether it is one of jaxid's own methods with fixed steps, which cannot fail."""
+        return isinstance(self.solver, RK4 | Exponential) and self.control is None
+
+    @property
+    def unrolled(self) -> bool:
+        """Whether equations are functions of scalars."""
+        return not (self.batched or isinstance(self.solver, Exponential))
 
 
 def _whole(solver: diffrax.AbstractSolver) -> bool:

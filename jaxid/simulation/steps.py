@@ -17,8 +17,7 @@ from ..effects import NOBODY, Coulomb
 from ..errors import JaxidWarning, ModelError
 from ..recording import Recordings
 from .batch import check_joints, held_at, held_names
-from .dynamics import Outside, instant
-from .integration import given
+from .dynamics import Outside, imposed, instant
 from .loop import ClosedLoop
 from .state import rest, unflatten
 from .stepping import RK4
@@ -58,7 +57,7 @@ def with_substeps(
     period = loop.controller.period
     longest = max(r.period for r in recordings)
     interval = longest if period is None else min(longest, period)
-    if given(loop) or isinstance(loop.stepping.solver, diffrax.AbstractImplicitSolver):
+    if imposed(loop) or isinstance(loop.stepping.solver, diffrax.AbstractImplicitSolver):
         still, moving = 0.0, 0.0
     else:
         still, moving = _rates(loop, recordings)
@@ -176,7 +175,7 @@ def with_batches(loop: ClosedLoop) -> ClosedLoop:
     a batch, a Jacobian of six joints takes a twelfth of the time. Needs fixed steps of RK4.
     """
     stepping = loop.stepping
-    if loop.joints <= UNROLLED or not stepping.plain or given(loop):
+    if loop.joints <= UNROLLED or not stepping.plain or imposed(loop):
         return loop
     solver = RK4(rolled=True, batched=True)
     return dataclasses.replace(loop, stepping=dataclasses.replace(stepping, solver=solver))
@@ -231,7 +230,7 @@ def sharpest(loop: ClosedLoop, recordings: Recordings) -> float:
     signs = [p for p in loop.free_parameters if p.place[-1] == "smoothing"]
     stepping = loop.stepping
     implicit = isinstance(stepping.solver, diffrax.AbstractImplicitSolver)
-    if not signs or given(loop) or implicit or stepping.control is not None:
+    if not signs or imposed(loop) or implicit or stepping.control is not None:
         return 0.0
     period = loop.controller.period
     longest = max(r.period for r in recordings)

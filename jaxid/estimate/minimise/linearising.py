@@ -11,7 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from ...simulation.integration import given
+from ...simulation.dynamics import imposed
 from ...simulation.sharing import (
     EndToEnd,
     at_once,
@@ -74,7 +74,7 @@ def _of_recordings(problem: Problem, whole: bool) -> Callable[[Any, Any], Point]
         return lambda theta, start: _over_mesh(problem, mesh, theta, start)
     # Each host device would compile the program, and they would collect results one by one.
     problem = dataclasses.replace(problem, mesh=None)
-    if mesh is None and given(problem.loop):
+    if mesh is None and imposed(problem.loop):
         return _Widened.of(problem, whole)
     return _linearisation(problem, whole, cores() if mesh is None else mesh.size)
 
