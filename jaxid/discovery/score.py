@@ -91,13 +91,14 @@ class Gram(eqx.Module):
 
     @classmethod
     def of_whitened(cls, white: Whitened) -> "Gram":
-        """The products of whitened data."""
-        import scipy
+        """The products of whitened data.
 
+        **Raises:** `LinAlgError` if they are not finite.
+        """
         x = white.signatures
-        # BLAS stores columns first, so its upper half is our lower half.
-        half = scipy.linalg.blas.ssyrk(1.0, x.T).astype(float)
-        gram = np.triu(half) + np.triu(half, 1).T
+        gram = (x.T @ x).astype(float)
+        if not np.isfinite(gram).all():
+            raise np.linalg.LinAlgError("the Gram matrix is not finite")
         rest = float(white.residual @ white.residual)
         return cls(gram, white.score(), white.size, rest, white.count)
 
@@ -193,15 +194,23 @@ def chance(value: float, freedom: int) -> float:
     return float(scipy.stats.chi2.sf(value, freedom)) if freedom else 1.0
 
 
-def effective_tests(gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0) -> float:
-    """Effective number of independent tests of the blocks, by noise drawn in their space.
+def effective_tests(
+    white: Whitened, gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0
+) -> float:
+    """Effective number of independent tests of the blocks, by drawn whitened residuals.
 
     The smallest p-value of correlated tests has the distribution of that of fewer independent ones.
+
+    **Arguments:**
+
+    - `gram`: of `white`.
     """
     import scipy
 
-    root = _root(gram.gram)
-    noise = root @ np.random.default_rng(seed).standard_normal((root.shape[1], draws))
+    drawn = np.random.default_rng(seed).standard_normal(
+        (draws, len(white.signatures)), white.signatures.dtype.type
+    )
+    noise = (drawn @ white.signatures).T.astype(float)
     smallest = np.ones(draws)
     for _, columns in by_width(blocks):
         inner = gram.gram[columns[:, :, None], columns[:, None, :]]
@@ -213,22 +222,6 @@ def effective_tests(gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0
     # give p-values in the tail that are three times too small.
     lowest = float(np.quantile(smallest, 0.1))
     return max(1.0, float(np.log(0.9) / np.log1p(-lowest)))
-
-
-def _root(gram: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n rank"]:
-    """A matrix whose product with its transpose is a Gram matrix, up to a tenth of `WEAK`.
-
-    Columns in single precision may be parallel up to rounding. A Cholesky decomposition with pivots
-    leaves out what the others explain.
-    """
-    import scipy
-
-    if not np.isfinite(gram).all():
-        raise np.linalg.LinAlgError("the Gram matrix is not finite")
-    lower, pivots, rank, _ = scipy.linalg.lapack.dpstrf(gram, tol=0.1 * WEAK, lower=1)
-    root = np.empty((len(gram), rank))
-    root[pivots - 1] = np.tril(lower)[:, :rank]
-    return root
 
 
 def corrected(p: float, tests: float) -> float:
