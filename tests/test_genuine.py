@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 from stories import scene_of, search_of
 
-from jaxid.effects import Stribeck, Viscous
+from jaxid.effects import EndStop, Stribeck, Viscous
 
 
 @pytest.mark.parametrize(
@@ -25,6 +25,19 @@ def test_a_stribeck_term_ends_or_falls(level, velocity, exponent, viscous, expec
     term = Stribeck(joint=1, level=level, velocity=velocity, exponent=exponent)
     beside = [Viscous(joint=1, coefficient=viscous), Viscous(joint=2, coefficient=99.0)]
     assert term.genuine(scene_of(3.0), beside) is expected
+
+
+@pytest.mark.parametrize(
+    ("side", "share", "expected"),
+    # Parts of the travel over which the stop acts; the last one ends beyond it.
+    [(1, 0.1, True), (-1, 0.1, True), (-1, 0.6, True), (1, 0.9, False), (-1, 1.2, False)],
+)
+def test_a_stop_leaves_a_part_of_the_travel_free(side, share, expected):
+    scene = scene_of(3.0)
+    low, high, travel = float(scene.q_low[0]), float(scene.q_high[0]), scene.travel(1)
+    angle = high - share * travel if side > 0 else low + share * travel
+    stop = EndStop(joint=1, stiffness=40.0, angle=angle, side=side)
+    assert stop.genuine(scene, []) is expected
 
 
 @pytest.mark.xdist_group("offset")

@@ -15,7 +15,7 @@ from jaxid.control import Tracking
 from jaxid.discovery.likelihood import noise_filters
 from jaxid.discovery.predict import Predictor
 from jaxid.discovery.release import doubtful, released
-from jaxid.discovery.signs import has_one_sign, of_one_sign
+from jaxid.discovery.signs import from_usual_signs, has_one_sign, of_one_sign
 from jaxid.discovery.system import System
 from jaxid.discovery.verify import Refits
 from jaxid.effects import Coulomb, Motion, Stribeck, TorqueOffset, Viscous, smooth_sign
@@ -251,6 +251,16 @@ def test_a_fit_that_ends_at_a_jump_is_repeated_from_a_usual_sign():
     table = found.table()
     for name, true in (("form1", 0.5), ("Fc1", DRY), ("Fv1", DRAG)):
         assert table.loc[name, "value"] == pytest.approx(true, abs=4 * table.loc[name, "std"])
+
+
+def test_only_a_sign_at_an_end_of_its_shapes_starts_from_a_usual_one():
+    loop = axis(smoothing=0.005).free("eps1", "form1")
+    assert from_usual_signs(loop.with_values(form1=1.2)) is None
+    ramp = from_usual_signs(loop.with_values(form1=1.5))
+    assert ramp is not None
+    values = {p.name: float(np.asarray(p.where(ramp))) for p in ramp.parameters}
+    assert values["form1"] == 0.5
+    assert values["eps1"] > 0.005
 
 
 def test_noise_does_not_determine_the_delay():

@@ -20,6 +20,8 @@ _SAME = 0.1
 _JUMPS = 0.02
 # Form between those of arctan and tanh.
 _BETWEEN = 0.5
+# Form above which a sign is a ramp, as a share of the largest one.
+_RAMP = 0.99
 
 
 def shapes_of_signs(
@@ -75,17 +77,22 @@ def has_one_sign(loop: ClosedLoop) -> bool:
     return True
 
 
-def without_jumps(loop: ClosedLoop) -> ClosedLoop | None:
-    """The loop with a usual shape of each estimated sign that jumps; None if none does."""
+def from_usual_signs(loop: ClosedLoop) -> ClosedLoop | None:
+    """The loop with a usual shape of each estimated sign that is a jump or a ramp; None if none is.
+
+    These are the ends of the range of shapes, where a fit can be in another minimum.
+    """
     free = {p.place: p for p in loop.free_parameters if p.place[2:] in OF_SIGN}
     values = {}
     for place, p in free.items():
-        if place[-1] != SIGN[0] or float(p.where(loop)) >= _JUMPS * p.declaration.scale:
+        if place[-1] != SIGN[0]:
             continue
-        values[p.name] = p.declaration.scale
         form = free.get((*place[:2], SIGN[1]))
-        if form is not None:
-            values[form.name] = _BETWEEN
+        ramp = form is not None and float(form.where(loop)) > _RAMP * form.declaration.upper
+        if float(p.where(loop)) < _JUMPS * p.declaration.scale or ramp:
+            values[p.name] = p.declaration.scale
+            if form is not None:
+                values[form.name] = _BETWEEN
     return loop.with_values(**values) if values else None
 
 

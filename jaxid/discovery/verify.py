@@ -17,7 +17,7 @@ from ..simulation.loop import ClosedLoop
 from .diagnosis import over_recordings
 from .hypotheses import free_of
 from .likelihood import noise_filters, score_of
-from .signs import has_one_sign, of_one_sign, reshaped, without_jumps
+from .signs import from_usual_signs, has_one_sign, of_one_sign, reshaped
 
 # Factor on the gap at the start of another refit. In a wide gap the link moves freely for longer,
 # so that all parameters of the contact influence the motion.
@@ -60,11 +60,12 @@ class Refits(eqx.Module):
         so it is repeated until the others have the same. They move half of the way each time,
         because a smoother sign of one friction makes that of another one sharper.
 
-        The error has another minimum where a sign jumps, because samples then do not determine its
-        form. Along an imposed motion a fit that ends there is repeated from a usual shape.
+        The error can have another minimum where a sign jumps, because samples then do not determine
+        its form, and where it is a ramp. Along an imposed motion a fit that ends there is repeated
+        from a usual shape.
         """
         found = self._with_one_sign(loop, noise)
-        usual = without_jumps(found.loop)
+        usual = from_usual_signs(found.loop)
         if not found.status.simulated or usual is None or not imposed(found.loop):
             return found
         again = self._with_one_sign(usual, noise)

@@ -1,6 +1,6 @@
 """Torque that depends on position: ripple, springs, end stops, gravity."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,6 +13,8 @@ from ._scene import Scene
 
 # Standard deviation of an offset before any recording, relative to the recorded torque.
 _LIKELY = 0.1
+# Largest share of the travel over which a stop acts; over more of it, it is a spring.
+_SPRING = 0.75
 
 
 class TorqueRipple(AbstractEffect):
@@ -104,6 +106,12 @@ class EndStop(AbstractEffect):
             for side, end in ((1, scene.q_high[j - 1]), (-1, scene.q_low[j - 1]))
             for share in (0.03, 0.07, 0.12, 0.18, 0.25)
         ]
+
+    def genuine(self, scene: Scene, beside: Sequence[AbstractEffect]) -> bool:
+        """Whether a part of the travel is free of the stop; otherwise it is a spring."""
+        j = self.joint - 1
+        end = scene.q_high[j] if self.side > 0 else scene.q_low[j]
+        return self.side * (float(end) - float(self.angle)) < _SPRING * scene.travel(self.joint)
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """Torque of the stop on the joint, `(joints,)`."""
