@@ -226,7 +226,7 @@ def integrate(
     - `substeps`: replaces the number in the settings; a traced value serves any number.
     """
     if imposed(loop):
-        return _along_reference(loop, intervals, x0, substeps), success()
+        return _states_along_reference(loop, intervals, x0, substeps), success()
     through = jax.tree.map(lambda leaf: leaf[:-1], intervals)
     rate = _rate(loop, through, x0)
     if loop.stepping.plain:
@@ -237,7 +237,7 @@ def integrate(
     return solution.ys, _number(solution.result)
 
 
-def _along_reference(
+def _states_along_reference(
     loop: ClosedLoop,
     intervals: Interval,
     x0: Float[Array, " states"],
