@@ -55,9 +55,13 @@ class Examined:
         self.failures = tuple(dict.fromkeys((*self.failures, said)))
 
     def visit(self, effects: tuple[AbstractEffect, ...], fit: Fit) -> Model:
-        """A fitted model with its score, which is stored and drawn."""
+        """A fitted model with its score, which is stored and drawn.
+
+        A model with an effect that only approximates another one is not stored: it has no weight.
+        """
         model = self.judged(effects, fit)
-        self.visited.add(model)
+        if not (effects and self.not_genuine(fit)):
+            self.visited.add(model)
         self.watched.fitted(model)
         return model
 
@@ -87,18 +91,19 @@ class Examined:
 
     def not_genuine(self, fit: Fit) -> tuple[AbstractEffect, ...]:
         """The added effects of a fit that only approximate another effect; a note names them."""
-        effects = fit.loop.effects
-        if not self.diagnoses:
-            # The recorded motion is not known before the first one.
-            return ()
-        # All of them describe the same motion.
-        scene = next(iter(self.diagnoses.values())).scene
-        found = tuple(
-            e for e in self.added(fit) if not e.genuine(scene, [x for x in effects if x is not e])
-        )
+        # The recorded motion is not known before the first diagnosis.
+        found = self.approximate(self.added(fit), fit.loop.effects) if self.diagnoses else ()
         if found:
             self.note(f"{listed(found)}: the fitted values are those of another effect")
         return found
+
+    def approximate(
+        self, effects: Sequence[AbstractEffect], among: Sequence[AbstractEffect]
+    ) -> tuple[AbstractEffect, ...]:
+        """Those effects that only approximate another effect, among all effects of their model."""
+        # All diagnoses describe the same motion.
+        scene = next(iter(self.diagnoses.values())).scene
+        return tuple(e for e in effects if not e.genuine(scene, [x for x in among if x is not e]))
 
     def had(self, at: Model, effects: Sequence[AbstractEffect]) -> Model | None:
         """An earlier refit of a set with the same values released; None if there is none."""

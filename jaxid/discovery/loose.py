@@ -49,8 +49,9 @@ def with_fewer(
             continue
         less = search.had(at, kept) or search.refitted(search.judged(added, fit), kept)
         assert less.fit is not None
-        if not undetermined(less.fit, len(kept) - len(at.effects)):
-            found.append(less)
+        if undetermined(less.fit, len(kept) - len(at.effects)) or search.not_genuine(less.fit):
+            continue
+        found.append(less)
     return min(found, key=lambda m: m.score, default=None)
 
 

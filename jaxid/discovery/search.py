@@ -220,9 +220,14 @@ class Search(Examined):
         ]
         best = min(better, key=lambda pair: pair[0].score, default=None)
         anchor = at.score - nothing if best is None else best[0].score - best[1].score
-        # A set without support or without determined values is no rival of the chosen one.
-        excluded = self.without_support | self.loose
-        rivals = [c for c in candidates if c.key not in excluded]
+        # A set without support or without determined values is no rival of the chosen one, nor is
+        # one whose effects only approximate others.
+        excluded, own = self.without_support | self.loose, self.seen[0].loop.effects
+        rivals = [
+            c
+            for c in candidates
+            if c.key not in excluded and not self.approximate(c.effects, (*own, *c.effects))
+        ]
         self.visited.add_predicted(rivals, at, anchor, self._left_by)
         return None if best is None else best[0]
 
@@ -314,7 +319,8 @@ class Search(Examined):
                 # An earlier fit may be at another minimum.
                 again = self.refitted(at, less)
                 had = min(again, had or again, key=lambda m: m.score)
-            found.append(had)
+            if had.fit is None or not self.not_genuine(had.fit):
+                found.append(had)
         best = min(found, key=lambda m: m.score, default=at)
         if best is not at and best.score < at.score + LIKELY:
             return best
