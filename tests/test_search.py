@@ -245,6 +245,7 @@ def test_of_two_effects_that_take_each_others_place_one_is_fitted(offset_case, o
     search = object.__new__(Search)
     search.added = lambda fit: fit.loop.effects[-2:]
     search.had, search.judged = (lambda at, kept: None), (lambda added, fit: None)
+    search.not_genuine = lambda fit: ()
     alone = offset_story[0].fit
     search.refitted = lambda model, kept: Model(tuple(kept), -5.0, fit=alone)
     assert with_fewer(search, Model((), 0.0), both, loose).effects == (loose[1],)
