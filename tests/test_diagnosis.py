@@ -11,7 +11,7 @@ from stories import Bump
 
 import jaxid
 from jaxid.discovery.hypotheses import candidates, survey
-from jaxid.discovery.score import Gram, Whitened, corrected, effective_tests
+from jaxid.discovery.score import Gram, _root, corrected, effective_tests
 from jaxid.effects import Curve, Motion, TorqueOffset
 
 
@@ -64,18 +64,28 @@ def test_results_show_themselves(bump_story):
 
 def test_effective_tests_are_honest():
     """Of tests that are one and the same there is one; of independent ones, their number."""
-
-    def number(signatures: np.ndarray) -> float:
-        rows, columns = signatures.shape
-        white = Whitened(np.zeros(rows), signatures, np.ones(columns), 1000.0)
-        return effective_tests(white, Gram.of_whitened(white), [[k] for k in range(columns)])
-
-    # A thousand draws give the lowest decile to 10 %.
-    assert number(np.ones((100, 40)) / 10) == pytest.approx(1.0, rel=0.15)
-    assert number(np.eye(40)) == pytest.approx(40.0, rel=0.15)
+    rng = np.random.default_rng(0)
+    ones = np.ones((40, 40)) + 1e-9 * np.eye(40)
+    same = Gram(ones, np.zeros(40), np.ones(40), 1.0, 1000.0)
+    apart = Gram(np.eye(40), rng.normal(size=40), np.ones(40), 1.0, 1000.0)
+    blocks = [[k] for k in range(40)]
+    # 400 draws give the mean of an exponential to 5 %; three of those.
+    assert effective_tests(same, blocks) == pytest.approx(1.0, rel=0.15)
+    assert effective_tests(apart, blocks) == pytest.approx(40.0, rel=0.15)
     assert corrected(0.01, 10) == pytest.approx(1 - 0.99**10)
+
+
+def test_noise_of_parallel_columns_has_their_covariance():
+    columns = np.random.default_rng(2).standard_normal((60, 25)).astype(np.float32)
+    columns /= np.linalg.norm(columns, axis=1)[:, None]
+    columns[7], columns[9] = columns[3], 1e-2 * columns[3]
+    gram = (columns @ columns.T).astype(float)
+    root = _root(gram)
+    assert root.shape[1] <= 26
+    np.testing.assert_allclose(root @ root.T, gram, atol=1e-5)
+    gram[4, 4] = np.nan
     with pytest.raises(np.linalg.LinAlgError):
-        number(np.full((40, 40), np.nan))
+        _root(gram)
 
 
 def test_a_joint_that_is_held_still_has_shapes_to_screen():

@@ -92,12 +92,12 @@ class Examined:
     def not_genuine(self, fit: Fit) -> tuple[AbstractEffect, ...]:
         """The added effects of a fit that only approximate another effect; a note names them."""
         # The recorded motion is not known before the first diagnosis.
-        found = self.approximate(self.added(fit), fit.loop.effects) if self.diagnoses else ()
+        found = self.approximations(self.added(fit), fit.loop.effects) if self.diagnoses else ()
         if found:
             self.note(f"{listed(found)}: the fitted values are those of another effect")
         return found
 
-    def approximate(
+    def approximations(
         self, effects: Sequence[AbstractEffect], among: Sequence[AbstractEffect]
     ) -> tuple[AbstractEffect, ...]:
         """Those effects that only approximate another effect, among all effects of their model."""

@@ -226,7 +226,7 @@ class Search(Examined):
         rivals = [
             c
             for c in candidates
-            if c.key not in excluded and not self.approximate(c.effects, (*own, *c.effects))
+            if c.key not in excluded and not self.approximations(c.effects, (*own, *c.effects))
         ]
         self.visited.add_predicted(rivals, at, anchor, self._left_by)
         return None if best is None else best[0]

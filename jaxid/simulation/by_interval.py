@@ -7,7 +7,7 @@ a jump between intervals, so no step crosses a boundary.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from .batch import Interval
+from .fixed_step import AbstractFixedStep
 
 Time = Float[Array, ""]
 Scalars = tuple[Float[Array, ""], ...]
@@ -101,7 +102,7 @@ class WithinIntervals(diffrax.AbstractSolver):
         return self.solver.step(terms, t0, t1, y0, args.at(t0), solver_state, made_jump)
 
 
-class ThroughIntervals(diffrax.AbstractSolver):
+class ThroughIntervals(AbstractFixedStep):
     """One of jaxid's own methods, whose step is a whole interval.
 
     The loop's inputs are looked up once per interval. Within an interval time is in seconds, and
@@ -112,20 +113,10 @@ class ThroughIntervals(diffrax.AbstractSolver):
     rate: Rate
     substeps: int | Int[Array, ""]
     split: bool = True
-    term_structure: ClassVar = diffrax.AbstractTerm
-    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
     def order(self, terms) -> int:
         """Order of the method."""
         return self.method.order(terms)
-
-    def init(self, terms, t0, t1, y0, args) -> None:
-        """No solver state is kept between steps."""
-        return None
-
-    def func(self, terms, t0, y0, args):
-        """The vector field."""
-        return terms.vf(t0, y0, args)
 
     def step(self, terms, t0: Any, t1: Any, y0, args, solver_state, made_jump):
         """One step through one interval."""

@@ -1,6 +1,6 @@
 """An exponential method, for states of effects along a motion that is given."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import diffrax
 import jax
@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import jax.scipy.linalg
 from jaxtyping import Array, Float, PyTree
 
+from .fixed_step import AbstractFixedStep
+
 # Below this size the quotient in `_phi` is a series, since its derivative loses digits.
 _SMALL = 1e-4
 
 
-class Exponential(diffrax.AbstractSolver):
+class Exponential(AbstractFixedStep):
     """The exponential Rosenbrock–Euler method, with inputs at the middle of a step.
 
     Of order two, exact for linear equations with constant inputs, and stable for steps of any
@@ -22,34 +24,26 @@ class Exponential(diffrax.AbstractSolver):
     Each leaf of the state is an array `(states,)`. Leaves are treated as independent of each other.
     """
 
-    term_structure: ClassVar = diffrax.AbstractTerm
-    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
-
     def order(self, terms: PyTree) -> int:
         """Two."""
         return 2
-
-    def init(self, terms, t0, t1, y0, args) -> None:
-        """No solver state is kept between steps."""
-        return None
-
-    def func(self, terms, t0, y0, args):
-        """The vector field."""
-        return terms.vf(t0, y0, args)
 
     def step(self, terms, t0: Any, t1: Any, y0, args, solver_state, made_jump):
         """One step from t0 to t1."""
         h = t1 - t0
         leaves, structure = jax.tree.flatten(y0)
 
-        def rates(*leaves: Float[Array, " _"]) -> list[Float[Array, " _"]]:
-            y = jax.tree.unflatten(structure, leaves)
-            return jax.tree.leaves(terms.vf(t0 + h / 2, y, args))
+        def end(k: int) -> Float[Array, " _"]:
+            def rate(leaf: Float[Array, " _"]) -> tuple[Float[Array, " _"], Float[Array, " _"]]:
+                y = jax.tree.unflatten(structure, [*leaves[:k], leaf, *leaves[k + 1 :]])
+                found = jax.tree.leaves(terms.vf(t0 + h / 2, y, args))[k]
+                return found, found
 
-        ends = []
-        for k, (leaf, rate) in enumerate(zip(leaves, rates(*leaves), strict=True)):
-            slope = jax.jacfwd(lambda *at, k=k: rates(*at)[k], argnums=k)(*leaves)
-            ends.append(leaf + h * _phi(h * slope) @ rate)
+            slope, now = jax.jacfwd(rate, has_aux=True)(leaves[k])
+            return leaves[k] + h * _phi(h * slope) @ now
+
+        # Most effects have no states.
+        ends = [end(k) if leaf.size else leaf for k, leaf in enumerate(leaves)]
         y1 = jax.tree.unflatten(structure, ends)
         return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 

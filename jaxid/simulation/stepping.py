@@ -1,7 +1,7 @@
 """Settings of a loop's integration: solver, steps, interpolation of the reference."""
 
 import inspect
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import diffrax
 import equinox as eqx
@@ -12,13 +12,11 @@ from jaxtyping import PyTree
 
 from ..errors import ModelError
 from .exponential import Exponential
+from .fixed_step import AbstractFixedStep
 
 
-class RK4(diffrax.AbstractSolver):
+class RK4(AbstractFixedStep):
     """The classical Runge–Kutta method of order four, for fixed steps (Kutta 1901).
-
-    diffrax's own methods compute error estimates and dense output. Even if unused, these cost more
-    than the physics of four states.
 
     **Arguments:**
 
@@ -28,20 +26,10 @@ class RK4(diffrax.AbstractSolver):
 
     rolled: bool = eqx.field(static=True, default=False)
     batched: bool = eqx.field(static=True, default=False)
-    term_structure: ClassVar = diffrax.AbstractTerm
-    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
     def order(self, terms: PyTree) -> int:
         """Four."""
         return 4
-
-    def init(self, terms, t0, t1, y0, args) -> None:
-        """No solver state is kept between steps."""
-        return None
-
-    def func(self, terms, t0, y0, args):
-        """The vector field."""
-        return terms.vf(t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step from t0 to t1."""
@@ -133,7 +121,7 @@ class Stepping(eqx.Module):
     @property
     def plain(self) -> bool:
         """Whether it is one of jaxid's own methods with fixed steps, which cannot fail."""
-        return isinstance(self.solver, RK4 | Exponential) and self.control is None
+        return isinstance(self.solver, AbstractFixedStep) and self.control is None
 
     @property
     def unrolled(self) -> bool:
