@@ -36,7 +36,7 @@ def in_jaxid(effect: Any, plant: Any) -> fx.AbstractEffect:
         case "Stribeck":
             return fx.Stribeck(j, e.torque, e.velocity, 1 / e.gamma)
         case "AsymmetricFriction":
-            return fx.AsymmetricFriction(j, e.viscous, e.coulomb, 1 / e.gamma)
+            return fx.AsymmetricFriction(j, e.viscous, e.coulomb, e.exponent, 1 / e.gamma)
         case "QuadraticDrag":
             return fx.QuadraticDrag(j, e.drag)
         case "LoadDependentFriction":

@@ -34,7 +34,7 @@ def biased(seed: int, smooth: bool, noise: float = 0.1, viscous: float = 0.0) ->
     """An axis with a constant torque, or with friction that is larger forward than backward."""
     record = recorded(seed, sharp, noise=noise)
     v = np.gradient(record.q[:, 0], record.time)
-    more = SIZE * (sharp(v) ** 2 if smooth else np.ones_like(v)) + viscous * v * sharp(v)
+    more = SIZE * (np.abs(sharp(v)) if smooth else np.ones_like(v)) + viscous * np.abs(v)
     return dataclasses.replace(record, tau=record.tau + more[:, None])
 
 
@@ -132,10 +132,11 @@ def test_friction_by_direction_is_named_and_an_offset_is_not():
 def test_where_noise_hides_the_difference_both_have_a_weight():
     found = searched(True, noise=2.0)
     assert found.verdict == "undetermined"
-    assert "asymmetric_friction on joint 1 has 0.95" in found.reason
-    assert any("may also be asymmetric_friction" in note for note in found.notes)
     weights = found.models.set_index("model")["weight"]
+    share = f"{weights['asymmetric_friction on joint 1']:.2g}"
+    assert f"asymmetric_friction on joint 1 has {share}" in found.reason
+    assert any("may also be asymmetric_friction" in note for note in found.notes)
     # Both have one value, and an offset of this size is less likely: the friction that is there has
     # more weight.
-    assert 0.5 < weights["asymmetric_friction on joint 1"] < 0.97
+    assert 0.5 < weights["asymmetric_friction on joint 1"] < 0.95
     assert weights.sum() == pytest.approx(1.0)

@@ -18,7 +18,15 @@ from jaxid.discovery.release import doubtful, released
 from jaxid.discovery.signs import from_usual_signs, has_one_sign, of_one_sign
 from jaxid.discovery.system import System
 from jaxid.discovery.verify import Refits
-from jaxid.effects import Coulomb, Motion, Stribeck, TorqueOffset, Viscous, smooth_sign
+from jaxid.effects import (
+    AsymmetricFriction,
+    Coulomb,
+    Motion,
+    Stribeck,
+    TorqueOffset,
+    Viscous,
+    smooth_sign,
+)
 from jaxid.noise import ARFilter
 
 MASS, DRAG, DRY, STIFF = 5.0, 4.0, 3.0, 8.0
@@ -102,6 +110,22 @@ def test_a_wrong_smoothing_is_released():
     assert table.loc["eps1", "value"] == pytest.approx(0.004 * np.arctanh(0.5), rel=0.02)
     assert table.loc["form1", "value"] > 0.95
     assert table.loc["Fc1", "value"] == pytest.approx(DRY, rel=0.01)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 2.0])
+def test_how_friction_by_direction_begins_near_standstill_is_released(exponent):
+    """The difference of the directions has the shape of the sign, or is smooth at standstill."""
+
+    def differs(v):
+        return arctan(v) + 0.3 * np.abs(arctan(v)) ** exponent
+
+    runs = [recorded(1, differs), recorded(2, differs)]
+    loop = axis().without("torque_offset").add(AsymmetricFriction(joint=1, coulomb=1.0))
+    found = released(predictor(runs, loop), 20.0)
+    assert (found is None) == (exponent == 1.0)
+    table = jaxid.fit(loop.free("da1"), runs, jaxid.OEM(progress=False)).table()
+    assert table.loc["da1", "value"] == pytest.approx(exponent, rel=0.05)
+    assert table.loc["dFc1", "value"] == pytest.approx(0.3 * DRY, rel=0.02)
 
 
 def test_the_exponent_of_a_stribeck_curve_is_released():

@@ -74,7 +74,7 @@ class Coulomb(AbstractEffect):
         return on_joint(self.joint, self.level * sign, motion)
 
 
-# Square of a relative speed at which a power of it still has a derivative by its exponent.
+# Square of a relative speed, or a sign, at which its power has a derivative by the exponent.
 _STILL = 1e-12
 # Share of a Stribeck peak below which the peak has ended.
 _ENDED = 0.25
@@ -135,15 +135,20 @@ class Stribeck(AbstractEffect):
 
 
 class AsymmetricFriction(AbstractEffect):
-    """Friction that differs by direction: (dFv v + dFc sigma(v)) sigma(v) (Janot et al. 2017).
+    """Friction that differs by direction: dFv |v| + dFc |sigma(v)|^da (Janot et al. 2017).
 
-    dFv and dFc are added to viscous and Coulomb friction forward and subtracted backward.
+    dFv and dFc are added to viscous and Coulomb friction forward and subtracted backward. The
+    exponent is held unless freed: at 1 the friction of each direction has the shape of sigma, at 2
+    the difference is smooth where the velocity changes sign.
     """
 
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     viscous: Scalar = parameter(0.0, symbol="dFv", unit="N·m·s/rad", scale=0.05)
     coulomb: Scalar = parameter(0.0, symbol="dFc", unit="N·m", scale=0.1)
+    exponent: Scalar = parameter(
+        1.0, symbol="da", unit="1", lower=0.5, upper=4.0, scale=1.0, free=False, linear=False
+    )
     smoothing: Scalar = smoothing_speed()
     form: Scalar = sign_form()
 
@@ -153,10 +158,11 @@ class AsymmetricFriction(AbstractEffect):
         return [cls(joint=j, **scene.sign(j)) for j in scene.joints]
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
-        """(dFv v + dFc sigma(v)) sigma(v) on the joint, `(joints,)`."""
+        """dFv |v| + dFc |sigma(v)|^da on the joint, `(joints,)`."""
         v = motion.v[self.joint - 1]
         sign = smooth_sign(v, self.smoothing, self.form)
-        return on_joint(self.joint, (self.viscous * v + self.coulomb * sign) * sign, motion)
+        dry = self.coulomb * (sign**2 + _STILL) ** (self.exponent / 2)
+        return on_joint(self.joint, self.viscous * jnp.abs(v) + dry, motion)
 
 
 class QuadraticDrag(AbstractEffect):

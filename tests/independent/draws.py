@@ -128,7 +128,8 @@ def draw_effect(
         case "asymmetric_friction":
             share = uniform(0.3, 1.0)
             both = sign * size * (1 - share) / v * float(rng.choice([-1.0, 1.0]))
-            return fx.AsymmetricFriction(joint, both, sign * size * share, gamma)
+            exponent = 1.0 if share > 0.65 else 2.0
+            return fx.AsymmetricFriction(joint, both, sign * size * share, gamma, exponent)
         case "quadratic_drag":
             return fx.QuadraticDrag(joint, size / v**2)
         case "load_dependent_friction":

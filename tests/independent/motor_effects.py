@@ -26,18 +26,22 @@ class Stribeck(Effect):
 
 @dataclass(frozen=True)
 class AsymmetricFriction(Effect):
-    """Half the difference of Fv (N m s) and Fc (N m) between the two directions."""
+    """Half the difference of Fv (N m s) and Fc (N m) between the two directions.
+
+    With exponent 1 the friction of each direction has the shape of sigma; with 2 the difference is
+    smooth at standstill.
+    """
 
     joint: int
     viscous: float
     coulomb: float
     gamma: float = 100.0
+    exponent: float = 1.0
     name, place, amplitudes = "asymmetric_friction", "motor", ("viscous", "coulomb")
 
     def needed(self, t: float, q: float, v: float) -> float:
-        """Torque, N m: (viscous v + coulomb sigma) sigma, so Fv+- = Fv +- viscous, Fc likewise."""
-        s = sigma(v, self.gamma)
-        return (self.viscous * v + self.coulomb * s) * s
+        """Torque, N m: Fv+- = Fv +- viscous, and Fc likewise, in steady motion."""
+        return self.viscous * abs(v) + self.coulomb * abs(sigma(v, self.gamma)) ** self.exponent
 
 
 @dataclass(frozen=True)
