@@ -21,9 +21,11 @@ from ..storage.classes import classes_of
 from .alongside import along_recorded, in_the_loop
 from .asked import Asked, check_apart
 from .comparison import compare
+from .diagnosis import over_recordings
 from .hypotheses import effect_on
 from .landscape import form
 from .models import Model, Named, named, probability, worth_keeping
+from .parts import without_parts
 from .remarks import remarks
 from .search import Search
 from .shapes import with_shapes
@@ -180,7 +182,8 @@ def _told(
         alike = {named(s.added): s.alike for s in steps if s.added is not None}
         reason = undecided(models, search.at, alike)
     if not interrupted and not reason and search.at.effects:
-        steps = _with_shapes(search, steps)
+        steps = _final(search, steps)
+        models = tuple(_as_shown(m, steps[-1]) if m.fit is search.at.fit else m for m in models)
     notes = (*remarks(steps, search.given, search.offsets), *search.failures)
     if unfinished:
         notes = (f"stopped at the limit of {search.asked.most} effects: raise most", *notes)
@@ -197,8 +200,8 @@ def _told(
     )
 
 
-def _with_shapes(search: Search, steps: Sequence[Step]) -> list[Step]:
-    """The steps, the last one with the shapes of added effects estimated.
+def _final(search: Search, steps: Sequence[Step]) -> list[Step]:
+    """The steps, the last one without needless parts of added effects and with their shapes free.
 
     The tests of the model are those with the shapes held: beside a free shape the size of an effect
     can be uncertain although the effect is not.
@@ -206,7 +209,8 @@ def _with_shapes(search: Search, steps: Sequence[Step]) -> list[Step]:
     search.watched.begin("fit", "fits with the shapes of added effects free")
     last, held_out = steps[-1], search.asked.held_out
     try:
-        fit = with_shapes(search.fits, search.at)
+        needed = without_parts(search.fits, search.at)
+        fit = with_shapes(search.fits, dataclasses.replace(search.at, fit=needed))
     except KeyboardInterrupt:
         search.note("held shapes of the added effects were not estimated: interrupted")
         return list(steps)
@@ -214,6 +218,12 @@ def _with_shapes(search: Search, steps: Sequence[Step]) -> list[Step]:
         held = None if held_out is None else compare(fit, held_out)
         last = dataclasses.replace(last, fit=fit, held_out=held)
     return [*steps[:-1], last]
+
+
+def _as_shown(model: Model, last: Step) -> Model:
+    """The final model of the table with the errors of its last fit; its score is unchanged."""
+    left = over_recordings(last.fit.error_percent.to_numpy())
+    return dataclasses.replace(model, fit=last.fit, left=left, held_out=last.held_out)
 
 
 def _stopped_short(most: int) -> str:

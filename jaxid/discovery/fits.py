@@ -72,6 +72,18 @@ class Fits:
         name = f"{piece_name(effects)}, from {at}"
         return self._saved(name, start, lambda: self._refits.filtered(start, noise))
 
+    def without_parts(
+        self, effects: Sequence[AbstractEffect], start: ClosedLoop, noise: Sequence[ARFilter]
+    ) -> Fit:
+        """The fit of a model with held parts, from the values of a loop.
+
+        **Arguments:**
+
+        - `effects`: its effects over the starting model.
+        """
+        name = f"{piece_name(effects)}, without parts"
+        return self._saved(name, start, lambda: self._refits.filtered(start, noise))
+
     def with_effects(
         self,
         before: Fit,

@@ -83,6 +83,8 @@ class AbstractEffect(eqx.Module):
       wrong minimum, so the stiffness is estimated as well.
     - `local`: it acts only in a part of the motion, such as a stop or a limit. That part may occur
       once, and other stretches of the recordings then do not determine the effect.
+    - `optional`: groups of amplitudes that may be zero while others are not, such as the second
+      harmonic of a wave. A group that explains less than its price is left out of the final fit.
     """
 
     inertial: ClassVar[bool] = False
@@ -94,6 +96,7 @@ class AbstractEffect(eqx.Module):
     several: ClassVar[bool] = False
     contact: ClassVar[bool] = False
     local: ClassVar[bool] = False
+    optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
 
     @classmethod
     def effect_name(cls) -> str:

@@ -26,6 +26,7 @@ class SharedShaft(AbstractEffect):
     """
 
     joint_fields = ("joint", "driven")
+    optional = ("viscous",), ("coulomb",), ("inertia",)
     joint: int = eqx.field(static=True)
     driven: int = eqx.field(static=True, default=2)
     viscous: Scalar = parameter(0.0, symbol="Fvs", unit="N·m·s/rad", lower=0.0, scale=0.05)

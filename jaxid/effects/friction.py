@@ -143,6 +143,7 @@ class AsymmetricFriction(AbstractEffect):
     """
 
     joint_fields = ("joint",)
+    optional = ("viscous",), ("coulomb",)
     joint: int = eqx.field(static=True)
     viscous: Scalar = parameter(0.0, symbol="dFv", unit="N·m·s/rad", scale=0.05)
     coulomb: Scalar = parameter(0.0, symbol="dFc", unit="N·m", scale=0.1)

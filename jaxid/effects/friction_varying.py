@@ -58,6 +58,7 @@ class PositionDependentFriction(AbstractEffect):
     """
 
     joint_fields = ("joint",)
+    optional = ("A1", "B1"), ("A2", "B2")
     joint: int = eqx.field(static=True)
     A1: Scalar = parameter(0.0, symbol="FA1_", unit="N·m", scale=0.1)
     B1: Scalar = parameter(0.0, symbol="FB1_", unit="N·m", scale=0.1)
@@ -99,6 +100,7 @@ class ThermalDrift(AbstractEffect):
     """Friction that relaxes as the joint warms: (Fvt v + Fct sigma(v)) exp(-t/T)."""
 
     joint_fields = ("joint",)
+    optional = ("viscous",), ("coulomb",)
     joint: int = eqx.field(static=True)
     viscous: Scalar = parameter(0.0, symbol="Fvt", unit="N·m·s/rad", scale=0.05)
     coulomb: Scalar = parameter(0.0, symbol="Fct", unit="N·m", scale=0.1)

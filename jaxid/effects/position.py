@@ -71,6 +71,7 @@ class Spring(AbstractEffect):
     """Hoses and cables: k (q - q0), with the preload k q0 as parameter."""
 
     joint_fields = ("joint",)
+    optional = (("preload",),)
     joint: int = eqx.field(static=True)
     stiffness: Scalar = parameter(0.0, symbol="k", unit="N·m/rad", scale=0.1)
     preload: Scalar = parameter(0.0, symbol="kq0_", unit="N·m", scale=0.1)
