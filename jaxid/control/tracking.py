@@ -13,6 +13,10 @@ from ..recording import Recording
 from ..signals.smoothing import even_times, resampled, signal_cutoff, smooth_motion
 from ._base import AbstractController, Reading, Reference, Signals
 
+# Largest cutoff on the motion as a share of the sample rate. There the second derivative of a cubic
+# spline is 22 % too large.
+_KNOWN = 1 / 4
+
 
 class Tracking(AbstractController):
     """tau = M (a_m + 2 zeta w (v_m - v) + w² (q_m - q)) + h: follows the recorded motion q_m.
@@ -22,9 +26,10 @@ class Tracking(AbstractController):
     deviate from q_m, the motion is imposed and nothing is simulated. Otherwise the loop is
     simulated and feedback corrects the deviation. Simulated and measured torque can be compared if
     both loops track equally well (Gautier, Janot, Vandanjon 2013). The recorded motion is
-    low-passed forward and backward before differentiation. The same filter is applied to measured
-    and simulated torque before they are compared (the parallel filter of Gautier 1997). The delay
-    advances the simulated torque there; a simulation gives it at the time at which it acts.
+    low-passed forward and backward before differentiation, at the frequency up to which it is
+    known (`known`). Another low-pass, at `cutoff`, is applied to measured and simulated torque
+    before they are compared (the parallel filter of Gautier 1997). The delay advances the simulated
+    torque there; a simulation gives it at the time at which it acts.
 
     **Arguments:**
 
@@ -32,8 +37,9 @@ class Tracking(AbstractController):
     - `damping`: damping ratio of the virtual loop.
     - `delay`: time by which torque acts later than recorded, s; estimated by a fit. It is half a
       period for a law that is computed at every sample and held in between.
-    - `cutoff`: cutoff of the low-pass, Hz. By default the frequency above which the recorded motion
-      is noise; a fit determines it from all its recordings.
+    - `cutoff`: cutoff of the low-pass on the torque, Hz. By default the frequency above which the
+      recorded motion is noise, at most an eighth of the sample rate; a fit determines it from all
+      its recordings.
     """
 
     bandwidth: float = 40.0
@@ -77,12 +83,19 @@ class Tracking(AbstractController):
         """Cutoff of the low-pass, Hz."""
         return float(self.cutoff or signal_cutoff(recording))
 
+    def known(self, recording: Recording) -> float:
+        """Cutoff of the low-pass on a recorded motion, Hz: that on the torque, or higher.
+
+        Near a reversal friction depends on higher frequencies of the velocity than are compared.
+        """
+        return max(self.comparable(recording), signal_cutoff(recording, highest=_KNOWN))
+
     def settled(self, recordings: Iterable[Recording]) -> "Tracking":
         """The controller with one cutoff for all recordings."""
         return dataclasses.replace(self, cutoff=self.cutoff or signal_cutoff(*recordings))
 
     def signals(self, recording: Recording) -> Signals:
         """The low-passed recorded motion, `(samples, joints)`."""
-        smooth = smooth_motion(recording, self.comparable(recording))
+        smooth = smooth_motion(recording, self.known(recording))
         q = resampled(even_times(recording), smooth, recording.time)
         return Signals(q, np.zeros_like(recording.tau))

@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ..control import Tracking
 from ..effects import AbstractEffect, ActuatorLag, TimeDelay
 from ..estimate import Fit
 from ..estimate.standstill import slow_note
-from ..simulation.batch import motion_cutoff
 from ..simulation.loop import ClosedLoop
 from ..simulation.widening import LEAD
 from .hypotheses import effect_on
@@ -77,7 +77,10 @@ def _lead(value: float, fit: Fit) -> str:
     Where friction jumps, acceleration jumps as well. There a low-pass of the position changes the
     velocity, so that its zero is later than that of the joint.
     """
-    constant = 1 / (2 * np.pi * motion_cutoff(fit.loop.controller, fit.recordings))
+    law = fit.loop.controller
+    # Leads are estimated along an imposed motion only.
+    assert isinstance(law, Tracking)
+    constant = 1 / (2 * np.pi * min(map(law.known, fit.recordings)))
     return _LOW_PASS.format(1e3 * constant) if value < constant else _SOFT
 
 

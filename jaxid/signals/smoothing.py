@@ -83,15 +83,19 @@ def smooth_motion(
     return low_pass(q, recording.rate, cutoff, order)
 
 
-def signal_cutoff(*recordings: Recording) -> float:
+def signal_cutoff(*recordings: Recording, highest: float = 1 / 8) -> float:
     """The frequency in Hz above which recorded motions do not determine acceleration.
 
     The spectrum of the acceleration, f⁴ times that of position, decreases until the encoder's noise
     raises it again. The result is its minimum, summed over joints relative to their speed, and over
     recordings. Of minima of about the same level the last is chosen, because another one may be
     between the frequencies of the reference and those of the loop's response to friction. It is at
-    least five times the frequency of largest speed and at most an eighth of the sample rate. For
-    recordings too short for a spectrum it is a tenth of the sample rate.
+    least five times the frequency of largest speed. For recordings too short for a spectrum it is a
+    tenth of the sample rate.
+
+    **Arguments:**
+
+    - `highest`: largest result as a share of the sample rate.
     """
     rate = min(r.rate for r in recordings)
     long = [r for r in recordings if r.samples >= 200]
@@ -105,7 +109,7 @@ def signal_cutoff(*recordings: Recording) -> float:
     centre, level = centres[0], np.sum(levels, axis=0)
     least = 5 * centre[int(np.argmax(level / centre**2))]
     cutoff = centre[_last_minimum(level, centre >= least)]
-    return float(min(max(least, cutoff), rate / 8))
+    return float(min(max(least, cutoff), rate * highest))
 
 
 def _acceleration(
