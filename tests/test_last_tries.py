@@ -43,6 +43,26 @@ def test_a_close_rival_that_was_only_predicted_is_fitted(offset_case, offset_sto
     assert replaced(search, found) is None
 
 
+@pytest.mark.xdist_group("offset")
+@pytest.mark.parametrize("worse", [0.0, 1000.0])
+def test_a_rival_whose_fit_is_worse_than_that_of_a_part_is_fitted_again(
+    worse, offset_case, offset_story
+):
+    """The fit without the effect has a lower score, so that with it is not at its minimum."""
+    search, start = search_of(offset_case), offset_story[0].steps[0]
+    without = search.visit((), start.fit)
+    last = with_chain(offset_case, start, Spring(joint=2, stiffness=0.01))[-1].fit
+    at = search.visit(search.added(last), last)
+    offset = (TorqueOffset(joint=2, level=0.01),)
+    score = without.score + worse if worse else at.score + 5.0
+    search.visited.add(Model(offset, score, fit=last, noise=at.noise))
+    found = replaced(search, at)
+    assert (found is not None) == bool(worse)
+    if found is not None:
+        assert found.names == (("torque_offset", 2),)
+        assert found.score < at.score - 5
+
+
 def diagnosis_of(*verdicts) -> Diagnosis:
     """One with these verdicts on effects, and on no curve."""
     found = object.__new__(Diagnosis)

@@ -4,6 +4,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 
+import numpy as np
+
 from ..effects import AbstractEffect, AsymmetricFriction, Backlash
 from ..errors import FitError, ModelError
 from ..estimate import Fit
@@ -33,7 +35,8 @@ def replaced(search: Examined, at: Model) -> Model | None:
     Predictions are inexact, so a predicted model that is not decisively worse may be better. If a
     shape of the joint's sign is estimated, they are less exact. An effect whose shape is held may
     be better with another shape. Along an imposed motion, where a fit takes seconds, it is fitted
-    with the shape free.
+    with the shape free. A rival whose fit is worse than that of a part of its effects is fitted
+    again, from the values of the chosen model.
     """
     assert at.fit is not None
     loop, own, best = at.fit.loop, Counter(map(form, at.effects)), at
@@ -46,19 +49,41 @@ def replaced(search: Examined, at: Model) -> Model | None:
         others = [e for e in m.effects if form(e) not in own]
         shaped = along and any(map(has_held_shape, others))
         known = m.fit is not None and not (shaped and shapes_of(m.fit.loop, len(m.effects)))
-        if known or m.curve is not None or len(m.effects) != len(at.effects):
+        if m.curve is not None or len(m.effects) != len(at.effects):
             return False
         one = (Counter(map(form, m.effects)) - own).total() == 1
+        if known:
+            return one and _at_another_minimum(search, m)
         inexact = shaped or any(reshaped(loop, e) for e in others)
         return one and bool(m.score < at.score + (reach if inexact else DECISIVE))
 
     rivals = search.visited.ranked(is_rival)
     for rival in rivals[:_RIVALS]:
-        if rival.fit is None:
+        if rival.fit is None or _at_another_minimum(search, rival):
             again = partial(search.fits.exchanged, loop, at.effects, rival.effects, rival.noise)
             best = _better(search, best, rival.effects, again)
         best = _with_free_shapes(search, best, rival.effects) if along else best
     return None if best is at else best
+
+
+def _at_another_minimum(search: Examined, model: Model) -> bool:
+    """Whether a fit with a part of a fitted model's effects is decisively better than it.
+
+    At the minimum, further parameters raise the score by no more than their price.
+    """
+    if model.fit is None:
+        return False
+    there, values = Counter(map(form, model.effects)), len(model.fit.names)
+    price = float(np.log(sum(map(np.count_nonzero, model.fit.residuals))))
+
+    def is_better(part: Model) -> bool:
+        if part.fit is None or part.curve is not None:
+            return False
+        own = Counter(map(form, part.effects))
+        more = price * max(values - len(part.fit.names), 0)
+        return own < there and part.score + more + DECISIVE < model.score
+
+    return bool(search.visited.ranked(is_better))
 
 
 def _with_free_shapes(search: Examined, best: Model, effects: Sequence[AbstractEffect]) -> Model:
