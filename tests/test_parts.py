@@ -45,7 +45,7 @@ def test_a_harmonic_that_is_not_there_is_left_out(sizes):
     second = {"FA2_1", "FB2_1"}
     assert (second <= set(found.names)) == (sizes is BOTH)
     assert found.loop.held_names == (set() if sizes is BOTH else second)
-    said = [n for n in found.notes if "explained less than the price" in n]
+    said = [n for n in found.notes if "held at zero" in n]
     assert len(said) == (sizes is ONCE)
     for name, size in zip(("FA1_1", "FB1_1", "FA2_1", "FB2_1"), sizes, strict=True):
         if name in found.names:

@@ -210,6 +210,8 @@ def _final(search: Search, steps: Sequence[Step]) -> list[Step]:
     last, held_out = steps[-1], search.asked.held_out
     try:
         needed = without_parts(search.fits, search.at)
+        if needed is not search.at.fit:
+            search.note(needed.notes[-1])
         fit = with_shapes(search.fits, dataclasses.replace(search.at, fit=needed))
     except KeyboardInterrupt:
         search.note("held shapes of the added effects were not estimated: interrupted")

@@ -33,7 +33,7 @@ def without_parts(fits: Fits, at: Model) -> Fit:
         fit, left_out = again, [*left_out, *names]
     if not left_out:
         return fit
-    said = f"{', '.join(left_out)} explained less than the price of a parameter, and are zero"
+    said = f"held at zero, because they explain less than a parameter costs: {', '.join(left_out)}"
     return dataclasses.replace(fit, notes=(*fit.notes, said))
 
 

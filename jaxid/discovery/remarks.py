@@ -8,6 +8,7 @@ from ..control import Tracking
 from ..effects import AbstractEffect, ActuatorLag, TimeDelay
 from ..estimate import Fit
 from ..estimate.standstill import slow_note
+from ..simulation.batch import motion_cutoff
 from ..simulation.loop import ClosedLoop
 from ..simulation.widening import LEAD
 from .hypotheses import effect_on
@@ -77,10 +78,10 @@ def _lead(value: float, fit: Fit) -> str:
     Where friction jumps, acceleration jumps as well. There a low-pass of the position changes the
     velocity, so that its zero is later than that of the joint.
     """
-    law = fit.loop.controller
-    # Leads are estimated along an imposed motion only.
-    assert isinstance(law, Tracking)
-    constant = 1 / (2 * np.pi * min(map(law.known, fit.recordings)))
+    law, recordings = fit.loop.controller, fit.recordings
+    own = isinstance(law, Tracking)
+    cutoff = min(map(law.known, recordings)) if own else motion_cutoff(law, recordings)
+    constant = 1 / (2 * np.pi * cutoff)
     return _LOW_PASS.format(1e3 * constant) if value < constant else _SOFT
 
 
