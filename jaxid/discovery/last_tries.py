@@ -81,7 +81,7 @@ def _at_another_minimum(search: Examined, model: Model) -> bool:
             return False
         own = Counter(map(form, part.effects))
         more = price * max(values - len(part.fit.names), 0)
-        return own < there and part.score + more + DECISIVE < model.score
+        return own < there and bool(part.score + more + DECISIVE < model.score)
 
     return bool(search.visited.ranked(is_better))
 
