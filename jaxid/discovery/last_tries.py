@@ -4,8 +4,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 
-import numpy as np
-
 from ..effects import AbstractEffect, AsymmetricFriction, Backlash
 from ..errors import FitError, ModelError
 from ..estimate import Fit
@@ -14,6 +12,7 @@ from ..simulation.dynamics import imposed
 from .examined import Examined
 from .explore import DECISIVE, key_of
 from .landscape import form
+from .likelihood import price_of_value
 from .models import LIKELY, Model, listed
 from .offsets import instead_of_offsets
 from .relevance import loses
@@ -74,7 +73,7 @@ def _at_another_minimum(search: Examined, model: Model) -> bool:
     if model.fit is None:
         return False
     there, values = Counter(map(form, model.effects)), len(model.fit.names)
-    price = float(np.log(sum(map(np.count_nonzero, model.fit.residuals))))
+    price = price_of_value(model.fit)
 
     def is_better(part: Model) -> bool:
         if part.fit is None or part.curve is not None:

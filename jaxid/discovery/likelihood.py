@@ -64,6 +64,11 @@ def score_of(fit: Fit, size: int = 0, offered: int = 0) -> Score:
     return _scored(series, len(fit.names) - len(fit.undetermined), paid)
 
 
+def price_of_value(fit: Fit) -> float:
+    """Price of one estimated value in a score: the logarithm of the number of compared samples."""
+    return float(np.log(sum(map(np.count_nonzero, fit.residuals))))
+
+
 def noise_filters(
     residuals: Sequence[Float[np.ndarray, "_samples joints"]],
 ) -> tuple[ARFilter, ...]:

@@ -2,14 +2,13 @@
 
 import dataclasses
 
-import numpy as np
-
 from ..estimate import Fit
 from ..parameters import Parameter
 from ..simulation.loop import ClosedLoop
 from .fits import Fits
-from .likelihood import score_of
+from .likelihood import price_of_value, score_of
 from .models import LIKELY, Model
+from .verify import wald
 
 
 def without_parts(fits: Fits, at: Model) -> Fit:
@@ -39,10 +38,10 @@ def without_parts(fits: Fits, at: Model) -> Fit:
 
 def _least(fit: Fit, added: int) -> list[Parameter] | None:
     """The optional part that explains least per value, if less than the price of each value."""
-    price = float(np.log(sum(map(np.count_nonzero, fit.residuals))))
+    price = price_of_value(fit)
     found: tuple[float, list[Parameter]] | None = None
     for group in _optional(fit.loop, added):
-        explained = _explained(fit, group) / len(group)
+        explained = wald(fit, [fit.names.index(p.name) for p in group]) / len(group)
         if explained < (price if found is None else found[0]):
             found = explained, group
     return None if found is None else found[1]
@@ -59,12 +58,3 @@ def _optional(loop: ClosedLoop, added: int) -> list[list[Parameter]]:
             if 0 < len(group) < len(amplitudes):
                 groups.append(group)
     return groups
-
-
-def _explained(fit: Fit, group: list[Parameter]) -> float:
-    """Wald's statistic of a part; 0 if the recordings do not determine it."""
-    at = [fit.names.index(p.name) for p in group]
-    value, covariance = np.asarray(fit.theta)[at], fit.covariance[np.ix_(at, at)]
-    if not np.isfinite(covariance).all():
-        return 0.0
-    return float(value @ np.linalg.pinv(covariance) @ value)

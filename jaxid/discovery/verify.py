@@ -271,14 +271,24 @@ def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
     place = next(k for k, e in enumerate(fit.loop.effects) if e is effect)
     places = values_of(fit.loop, place)
     own = [k for k, linear in places if linear]
-    covariance = fit.covariance[np.ix_(own, own)]
-    if effect.finite or not own or not np.isfinite(covariance).all():
+    if effect.finite or not own:
         return False
-    values = fit.theta[own]
-    # The increase of the squared error without the effect (Wald), and the decrease of the price.
-    lost = float(values @ np.linalg.pinv(covariance) @ values)
+    # The increase of the squared error without the effect, and the decrease of the price.
+    lost = wald(fit, own)
     saved = len(places) * np.log(sum(r.size for r in fit.residuals)) + price
     return bool(lost > (_RESHAPED if reshaped(fit.loop, effect) else _CERTAIN) * saved)
+
+
+def wald(fit: Fit, places: Sequence[int]) -> float:
+    """Wald's statistic of some values of `theta`; 0 if the recordings do not determine them.
+
+    It is the increase of the whitened squared error if these values are zero.
+    """
+    covariance = fit.covariance[np.ix_(places, places)]
+    if not np.isfinite(covariance).all():
+        return 0.0
+    values = np.asarray(fit.theta)[list(places)]
+    return float(values @ np.linalg.pinv(covariance) @ values)
 
 
 def values_of(loop: ClosedLoop, place: int) -> list[tuple[int, bool]]:
