@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +24,14 @@ from ._world_physics import (
     draw_robot,
     draw_shape,
 )
-from ._world_simulation import Law, Signals, inertias, simulate
+from ._world_simulation import Law, Signals, Undrawable, inertias, simulate
 
 KINDS = ("single", "double", "clean", "outside")
 LAWS = ("unknown", "sampled", "continuous")
 NOISES = ("white", "coloured", "heavy", "bursts")
 NAMES = ("fit_1", "fit_2", "held_out")
+# Draws of a case, until one can be simulated and its effects act.
+_DRAWS = 20
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,14 @@ def draw_wanted(
 
 
 def make(wanted: Wanted) -> Case:
-    """The case, simulated; the same for every law."""
+    """The case, simulated; the same for every law; drawn again if it is not usable."""
+    for seed in range(wanted.seed, wanted.seed + _DRAWS):
+        with suppress(Undrawable):
+            return _made(replace(wanted, seed=seed))
+    raise Undrawable(f"case {wanted.number} is not usable in {_DRAWS} draws")
+
+
+def _made(wanted: Wanted) -> Case:
     rng = np.random.default_rng(wanted.seed)
     robot = draw_robot(rng, wanted.robot)
     m = inertias(robot)
@@ -171,7 +181,10 @@ def _along(effect: Hidden, run: Signals) -> np.ndarray:
 
 
 def _hidden(rng, wanted, robot, frictions, speed, duration, clean, level) -> tuple[Hidden, ...]:
-    """The effects, each 3 to 12 times the noise before parameters absorb a part."""
+    """The effects, each 3 to 12 times the noise before parameters absorb a part.
+
+    **Raises:** `Undrawable` if one does not act in the first recording.
+    """
     found = []
     for name in wanted.effects:
         places = [j for j, link in enumerate(robot.links) if not (link.slides and name in TURNING)]
@@ -180,6 +193,8 @@ def _hidden(rng, wanted, robot, frictions, speed, duration, clean, level) -> tup
         link = robot.links[j]
         effect = Hidden(name, j, frictions[j], link.travel, float(speed[j]), shape, link.slides)
         plain = np.sqrt(np.mean(_along(effect, clean) ** 2))
+        if plain == 0.0:
+            raise Undrawable(f"{name} on joint {j + 1} does not act in the first recording")
         effect.size = float(level[j] * math.exp(rng.uniform(math.log(3), math.log(12))) / plain)
         if name == "asymmetric_friction":
             effect.size *= float(rng.choice([-1.0, 1.0]))

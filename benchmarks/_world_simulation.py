@@ -13,6 +13,10 @@ STEP = 1e-4
 TICK = 10  # steps
 
 
+class Undrawable(ValueError):
+    """The drawn numbers give no usable simulation."""
+
+
 @dataclass(frozen=True)
 class Law:
     """PD, optionally with integral, at 1 kHz from encoders; velocity by low-passed difference."""
@@ -67,7 +71,10 @@ def simulate(
     duration: float,
     hidden: Sequence[Hidden] = (),
 ) -> Signals:
-    """A run from rest; commanded torque is held between ticks, and acts without delay."""
+    """A run from rest; commanded torque is held between ticks, and acts without delay.
+
+    **Raises:** `Undrawable` if the simulation diverges.
+    """
     model = loaded(robot, frictions)
     data = mujoco.MjData(model)
     n = len(robot.links)
@@ -103,6 +110,8 @@ def simulate(
             data.qfrc_applied[:] = acting
             mujoco.mj_step(model, data)
     arrays = {name: np.array(row) for name, row in rows.items()}
-    if not all(np.isfinite(x).all() for x in arrays.values()):
-        raise ValueError(f"the simulation of {robot.name} diverged")
+    # MuJoCo restarts a simulation that diverges, and goes on.
+    restarted = data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number > 0
+    if restarted or not all(np.isfinite(x).all() for x in arrays.values()):
+        raise Undrawable(f"the simulation of {robot.name} diverged")
     return Signals(np.arange(ticks) * period, **arrays)

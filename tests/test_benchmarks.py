@@ -291,6 +291,24 @@ def test_worlds_tell_what_a_logger_aliases():
     np.testing.assert_array_equal(unexplained(seen, "sampled"), seen["noise"])
 
 
+def test_a_world_whose_effect_does_not_act_is_drawn_again():
+    pytest.importorskip("mujoco")
+    if not (ROOT / "benchmarks").is_dir():
+        pytest.skip("no benchmarks beside the tests: they are part of a checkout alone")
+    from benchmarks import _world_cases as cases
+    from benchmarks._world_simulation import Signals, Undrawable
+
+    rng = np.random.default_rng(1)
+    robot = cases.draw_robot(rng, "axis")
+    friction = cases.Friction(1.0, 1.0, "tanh", 0.01)
+    still = np.zeros((1000, 1))
+    run = Signals(np.arange(1000) / 1000, still, still, still, still)
+    wanted = cases.Wanted(0, "single", 1, ("end_stop",), "axis", "tanh", "white", "unknown")
+    one = np.ones(1)
+    with pytest.raises(Undrawable, match="end_stop on joint 1 does not act"):
+        cases._hidden(rng, wanted, robot, (friction,), one, 1.0, run, one)
+
+
 @pytest.mark.slow
 def test_baselines_answer_on_the_recordings_of_the_worlds(tmp_path):
     for module in ("mujoco", "pinocchio", "pysindy", "gplearn", "sklearn"):
