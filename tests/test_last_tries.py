@@ -10,7 +10,7 @@ from stories import recordings_of, scene_of, search_of, two_link_of, with_chain
 
 import jaxid
 from jaxid.discovery.diagnosis import Diagnosis
-from jaxid.discovery.last_tries import replaced, with_transmission
+from jaxid.discovery.last_tries import doubtful, replaced, with_transmission
 from jaxid.discovery.models import Model
 from jaxid.discovery.transmissions import similar_ones, suspected
 from jaxid.discovery.verify import Refits, held_shapes
@@ -61,6 +61,30 @@ def test_a_rival_whose_fit_is_worse_than_that_of_a_part_is_fitted_again(
     if found is not None:
         assert found.names == (("torque_offset", 2),)
         assert found.score < at.score - 5
+
+
+@pytest.mark.xdist_group("offset")
+def test_a_predicted_model_that_makes_an_effect_doubtful_is_fitted(offset_case, offset_story):
+    """Without the spring, and with weight: the offset is better, a second spring has no value."""
+    search, start = search_of(offset_case), offset_story[0].steps[0]
+    search.visit((), start.fit)
+    last = with_chain(offset_case, start, Spring(joint=2, stiffness=0.01))[-1].fit
+    at = search.visit(search.added(last), last)
+    offset = (TorqueOffset(joint=2, level=0.01),)
+    search.visited.add(Model(offset, at.score + 20.0, noise=at.noise, beyond=1))
+    assert doubtful(search, at) is None
+    pair = Model(
+        (*offset, Spring(joint=1, stiffness=0.01)), at.score - 5.0, noise=at.noise, beyond=2
+    )
+    search.visited.add(pair)
+    assert doubtful(search, at) is None
+    assert pair.key not in [m.key for m in search.visited.ranked()]
+    search.visited.add(Model(offset, at.score + 5.0, noise=at.noise, beyond=1))
+    found = doubtful(search, at)
+    assert found is not None
+    assert found.names == (("torque_offset", 2),)
+    assert found.score < at.score - 5
+    assert doubtful(search, found) is None
 
 
 def diagnosis_of(*verdicts) -> Diagnosis:

@@ -13,6 +13,7 @@ from .examined import Examined
 from .explore import DECISIVE, key_of
 from .landscape import form
 from .likelihood import price_of_value
+from .loose import undetermined
 from .models import LIKELY, Model, listed
 from .offsets import instead_of_offsets
 from .relevance import loses
@@ -24,6 +25,8 @@ from .watched import ROUND
 # Largest number of predicted models of a kind that are fitted because they may replace the chosen
 # one.
 _RIVALS = 2
+# Largest number of predicted models that are fitted because they make the chosen effects doubtful.
+_DOUBTS = 4
 # Relative error of predicted decreases of the score if a shape of a sign is estimated.
 _INEXACT = 0.2
 
@@ -98,6 +101,39 @@ def _with_free_shapes(search: Examined, best: Model, effects: Sequence[AbstractE
     start = loop.free(*[p.name for p in held])
     again = partial(search.fits.with_shapes, rival.effects, start, rival.noise)
     return _better(search, best, rival.effects, again)
+
+
+def doubtful(search: Examined, at: Model) -> Model | None:
+    """The best fit of a model without some chosen effect, if it is better.
+
+    Such a model makes the effect improbable by its weight. If it was only predicted, from a model
+    with fewer effects, its score is inexact, so it is fitted. It has no weight if it cannot be
+    fitted, or if the recordings determine no value of one of its effects.
+    """
+    assert at.fit is not None
+    best, own = at, set(at.names)
+
+    def contradicts(m: Model) -> bool:
+        alone = m.fit is None and m.curve is None
+        return alone and bool(own - set(m.names)) and bool(m.score < best.score + LIKELY)
+
+    for _ in range(_DOUBTS):
+        rival = next(iter(search.visited.ranked(contradicts)), None)
+        if rival is None:
+            break
+        again = partial(search.fits.exchanged, at.fit.loop, at.effects, rival.effects, rival.noise)
+        found = _better(search, best, rival.effects, again)
+        fitted = search.visited.fitted(rival.effects)
+        if fitted is None or undetermined(_fit_of(fitted), len(rival.effects)):
+            search.visited.drop(rival.key)
+        else:
+            best = found
+    return None if best is at else best
+
+
+def _fit_of(model: Model) -> Fit:
+    assert model.fit is not None
+    return model.fit
 
 
 def with_transmission(search: Examined, at: Model) -> Model | None:

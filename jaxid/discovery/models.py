@@ -150,6 +150,10 @@ class Visited:
         if had is None or (model.beyond, model.score) < (had.beyond, had.score):
             self._models[model.key] = model
 
+    def drop(self, key: tuple) -> None:
+        """Removes a model."""
+        del self._models[key]
+
     def forget(self, gone: set[tuple]) -> None:
         """Removes all models with an effect of these forms."""
         self._models = {k: m for k, m in self._models.items() if not gone.intersection(k)}

@@ -17,7 +17,7 @@ from .diagnosis import Diagnosis, over_recordings, share_left
 from .examined import Examined
 from .explore import DECISIVE, Candidate, explore, key_of, largest_first
 from .landscape import Landscape, forms_of
-from .last_tries import replaced, with_transmission, without_offset
+from .last_tries import doubtful, replaced, with_transmission, without_offset
 from .likelihood import price
 from .loose import undetermined, with_fewer, without_loose
 from .models import LIKELY, Model, Named, listed
@@ -77,7 +77,7 @@ class Search(Examined):
             if better is None and (better := self._without_one(at)) is not None:
                 gone = [n for n in at.names if n not in better.names]
                 self.removed = (*self.removed, *gone)
-            for attempt in (replaced, with_transmission, without_offset):
+            for attempt in (replaced, with_transmission, without_offset, doubtful):
                 better = attempt(self, at) if better is None else better
             if better is None:
                 break
@@ -226,7 +226,8 @@ class Search(Examined):
         rivals = [
             c
             for c in candidates
-            if c.key not in excluded and not self.approximations(c.effects, (*own, *c.effects))
+            if key_of(c.effects) not in excluded
+            and not self.approximations(c.effects, (*own, *c.effects))
         ]
         self.visited.add_predicted(rivals, at, anchor, self._left_by)
         return None if best is None else best[0]
