@@ -184,7 +184,9 @@ def select(white: Whitened, blocks: Blocks, most: int = 12, margin: float = 10.0
             break
         chosen.append(best)
         own = x[:, list(blocks[best])]
-        own = strong_directions(own - taken @ (taken.T @ own))
+        # OpenBLAS reports invalid operations on some finite arrays (numpy issue 24067).
+        with np.errstate(invalid="ignore"):
+            own = strong_directions(own - taken @ (taken.T @ own))
         taken = np.concatenate([taken, own], axis=1)
         across = own.T @ x
         score = score - (own.T @ residual) @ across
