@@ -170,7 +170,8 @@ def test_an_accessibility_checker_finds_nothing_serious(browser: Any) -> None:
 
 
 def test_figures_follow_a_change_of_theme(opened: Opened) -> None:
-    ink = 'document.querySelector("[data-figure]").layout.font.color'
+    # Figures in folded panels are not drawn yet.
+    ink = 'document.querySelector("[data-figure].js-plotly-plot").layout.font.color'
     light = opened.page.evaluate(ink)
     opened.page.emulate_media(color_scheme="dark")
     opened.page.wait_for_timeout(300)
