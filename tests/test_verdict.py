@@ -13,6 +13,7 @@ import jaxid
 from jaxid.control import Sampled
 from jaxid.discovery.models import Model
 from jaxid.discovery.remarks import looks_sampled
+from jaxid.discovery.undecided import undecided
 from jaxid.discovery.verdict import (
     _power,
     _spread,
@@ -20,7 +21,6 @@ from jaxid.discovery.verdict import (
     indefinite,
     on_unseen,
     refuted,
-    undecided,
 )
 from jaxid.discovery.verify import Refits
 from jaxid.effects import Spring, TimeDelay, TorqueOffset, TorqueRipple
@@ -144,32 +144,42 @@ def test_a_further_effect_that_is_probable_is_undecided(offset_story):
     offset, spring = TorqueOffset(joint=2), Spring(joint=1)
     start, chosen = Model((), 0.0), Model((offset,), -50.0, fit=fit)
     more = Model((offset, spring), -55.0, fit=fit)
-    said = undecided([more, chosen, start], chosen, {})
+    said = undecided([more, chosen, start], chosen, {}, WORTH)
     assert "a further effect have a probability of 0.924, most of all spring on joint 1" in said
     # Not if it was only predicted, or if it is worse.
-    assert undecided([dataclasses.replace(more, fit=None), chosen, start], chosen, {}) == ""
+    assert undecided([dataclasses.replace(more, fit=None), chosen, start], chosen, {}, WORTH) == ""
     worse = dataclasses.replace(more, score=-49.0)
-    assert undecided([chosen, worse, start], chosen, {}) == ""
+    assert undecided([chosen, worse, start], chosen, {}, WORTH) == ""
+    # Nor if it raises the error on held-out recordings.
+    first, last = (offset_story[0].steps[k] for k in (0, -1))
+    noise = last.diagnosis.noise
+    chosen, more = (
+        dataclasses.replace(m, noise=noise, held_out=step.held_out)
+        for m, step in ((chosen, last), (more, first))
+    )
+    assert undecided([more, chosen, start], chosen, {}, WORTH) == ""
+    more = dataclasses.replace(more, held_out=last.held_out)
+    assert undecided([more, chosen, start], chosen, {}, WORTH) == said
 
 
 def test_a_start_that_shares_the_weight_is_undecided():
     start, rival = Model((), 100.0), Model((TorqueOffset(joint=2),), 98.0)
     models = [dataclasses.replace(rival, weight=0.73), dataclasses.replace(start, weight=0.27)]
-    assert "only 2 larger" in undecided(models, rival, {})
+    assert "only 2 larger" in undecided(models, rival, {}, WORTH)
     sure = dataclasses.replace(rival, score=90.0)
     sure = dataclasses.replace(sure, weight=0.9)
-    assert undecided([sure, start], sure, {}) == ""
+    assert undecided([sure, start], sure, {}, WORTH) == ""
     # Models without the effect have more weight, unless their effect is indistinguishable.
     other = Model((Spring(joint=1),), 80.0, weight=0.99)
     models = [other, dataclasses.replace(sure, weight=0.01), start]
-    said = undecided(models, sure, {})
+    said = undecided(models, sure, {}, WORTH)
     assert "without torque_offset on joint 2 have a probability of 0.99" in said
     assert "spring on joint 1" in said
-    assert undecided(models, sure, {("torque_offset", 2): [("spring", 1)]}) == ""
+    assert undecided(models, sure, {("torque_offset", 2): [("spring", 1)]}, WORTH) == ""
     alone = [dataclasses.replace(start, weight=0.9), dataclasses.replace(rival, weight=0.1)]
-    assert undecided(alone, alone[0], {}) == ""
+    assert undecided(alone, alone[0], {}, WORTH) == ""
     crowd = [dataclasses.replace(start, weight=0.4), Model((Spring(joint=1),), 101, weight=0.3)]
-    assert "spring on joint 1" in undecided(crowd, crowd[0], {})
+    assert "spring on joint 1" in undecided(crowd, crowd[0], {}, WORTH)
 
 
 def test_a_fit_that_leaves_a_third_says_what_to_check(found):

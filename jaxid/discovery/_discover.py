@@ -32,6 +32,7 @@ from .shapes import with_shapes
 from .step import Step
 from .story import Discovery
 from .text import joined
+from .undecided import undecided
 from .verdict import (
     Outcome,
     explains_little,
@@ -40,7 +41,6 @@ from .verdict import (
     on_unseen,
     refuted,
     risen,
-    undecided,
 )
 
 _STOPPED = "the search was interrupted; resume=... continues it from its saved steps"
@@ -180,7 +180,8 @@ def _told(
         steps = [s if s.added is None else dataclasses.replace(s, probability=None) for s in steps]
     elif not unfinished and not reason:
         alike = {named(s.added): s.alike for s in steps if s.added is not None}
-        reason = undecided(models, search.at, alike)
+        chosen = next((m for m in models if m.key == search.at.key), search.at)
+        reason = undecided(models, chosen, alike, search.asked.worth)
     if not interrupted and not reason and search.at.effects:
         steps = _final(search, steps)
         models = tuple(_as_shown(m, steps[-1]) if m.fit is search.at.fit else m for m in models)

@@ -1,7 +1,6 @@
 """Tests that the final model must pass; otherwise the verdict is `undetermined`."""
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -16,10 +15,8 @@ from .diagnosis import Diagnosis, over_recordings
 from .episodes import in_episodes
 from .explore import DECISIVE
 from .floor import SPOKEN, Floor, floor_of
-from .hypotheses import effect_on
-from .likelihood import weights
 from .loose import undetermined
-from .models import LIKELY, Model, Named, listed, probability
+from .models import listed
 from .relevance import REFUTED, allowed
 from .score import spanned
 from .step import OnUnseen
@@ -31,8 +28,6 @@ Outcome = Literal["adequate", "explained", "outside_catalogue", "undetermined"]
 _SURE = 4.0
 # Ratio of the residual's power to that of its innovations above which it is not white noise.
 _COLOURED = 1.5
-# Smallest probability of the starting model for the verdict `adequate`.
-_HALF = 0.5
 # Smallest significant increase of the error on held-out recordings, in standard deviations.
 _ROSE = 3.0
 
@@ -51,65 +46,6 @@ def _to_check(fit: Fit) -> str:
             "check the units of each joint, signs, the order of the joints, time stamps and the "
             "control law"
         )
-    )
-
-
-def undecided(
-    models: Sequence[Model], chosen: Model, alike: Mapping[Named, Sequence[Named]]
-) -> str:
-    """The reason if scores do not decide for the chosen model; empty if they do.
-
-    **Arguments:**
-
-    - `alike`: for each effect of the chosen model, the effects that these recordings cannot
-      distinguish from it.
-    """
-    start = next(m for m in models if not m.effects and m.curve is None)
-    if not chosen.effects:
-        if start.weight >= _HALF:
-            return ""
-        rival = next(m for m in models if m is not start)
-        return (
-            f"the starting model has a probability of only {start.weight:.2g}, and "
-            f"{rival.label} has {rival.weight:.2g}: record more, or longer"
-        )
-    if chosen.score < start.score - LIKELY:
-        return _improbable(models, chosen, alike) or _incomplete(models, chosen)
-    return (
-        f"the score of the starting model is only {start.score - chosen.score:.2g} larger "
-        f"({LIKELY:.0f} are odds of 20 to 1): record more, or longer"
-    )
-
-
-def _improbable(
-    models: Sequence[Model], chosen: Model, alike: Mapping[Named, Sequence[Named]]
-) -> str:
-    """The reason if an effect of the chosen model is improbable; empty if none is."""
-    for name in chosen.names:
-        group = {name, *alike.get(name, ())}
-        share = probability(models, *group)
-        if share < _HALF:
-            plain = [m for m in models if m.curve is None]
-            rival = next(m for m in plain if not group.intersection(m.names))
-            return (
-                f"models without {effect_on(*name)} have a probability of {1 - share:.3g}, most of "
-                f"all {rival.label}: record other motions, or choose a model from the table"
-            )
-    return ""
-
-
-def _incomplete(models: Sequence[Model], chosen: Model) -> str:
-    """The reason if a further effect is probable, although not by odds of 20 to 1."""
-    mine = Counter(chosen.key)
-    more = [m for m in models if m.fit is not None and m.curve is None and mine < Counter(m.key)]
-    best = min(more, key=lambda m: m.score, default=chosen)
-    share = 1.0 - float(weights([m.score for m in (chosen, *more)])[0])
-    if share < _HALF:
-        return ""
-    (further, *_) = (Counter(best.names) - Counter(chosen.names)).elements()
-    return (
-        f"models with a further effect have a probability of {share:.3g}, most of all "
-        f"{effect_on(*further)}: record more, or longer"
     )
 
 
