@@ -2,10 +2,15 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
-from stories import scene_of, search_of
+from stories import recordings_of, scene_of, search_of
 
-from jaxid.effects import EndStop, Stribeck, Viscous
+import jaxid
+from jaxid.discovery.hypotheses import survey
+from jaxid.effects import EndStop, Motion, Stribeck, ThermalDrift, Viscous
 
 
 @pytest.mark.parametrize(
@@ -38,6 +43,32 @@ def test_a_stop_leaves_a_part_of_the_travel_free(side, share, expected):
     angle = high - share * travel if side > 0 else low + share * travel
     stop = EndStop(joint=1, stiffness=40.0, angle=angle, side=side)
     assert stop.genuine(scene, []) is expected
+
+
+@pytest.mark.parametrize(
+    ("returned", "expected"),
+    # The joint moves back after these times, s; zero if it never does.
+    [((), True), ((0.0,), True), ((2.0,), True), ((6.0,), False)],
+)
+def test_a_drift_acts_in_both_directions(returned, expected):
+    scene = dataclasses.replace(scene_of(3.0), returned=returned)
+    assert ThermalDrift(joint=1, time_constant=2.0).genuine(scene, []) is expected
+
+
+def test_the_time_of_motion_in_both_directions_is_that_of_the_first_recording(offset_case):
+    loop, (fitting, _) = jaxid.scara(), recordings_of(offset_case)
+    t = np.tile(np.arange(0, 4, 0.01), (2, 1))
+    v = np.stack([np.sin(2 * np.pi * t / period) for period in (2.0, 6.0)], axis=-1)
+    v[1] = 0.01
+
+    def at(t, v):
+        return Motion(t, q=v, v=v, a=v, tau=v, state=jnp.zeros(0), label=jnp.array(0))
+
+    along = jax.vmap(jax.vmap(at))
+    tones = ((), ())
+    both = survey(loop, fitting, along(jnp.array(t), jnp.array(v)), tones).returned
+    assert both == pytest.approx((1.0, 3.0), abs=0.06)
+    assert survey(loop, fitting, along(jnp.array(t), jnp.abs(v)), tones).returned == (0.0, 0.0)
 
 
 @pytest.mark.xdist_group("offset")

@@ -18,6 +18,9 @@ from ..simulation.inertia import mass_matrices
 from ..simulation.loop import ClosedLoop
 from .signs import shapes_of_signs
 
+# Share of a joint's highest speed above which it moves.
+_MOVES = 0.05
+
 
 class Hypothesis(eqx.Module):
     """One effect at one setting, with its columns in the table of signatures.
@@ -99,7 +102,21 @@ def survey(
         tuple(loop.arm.couplings()),
         loop.arm.in_space(),
         not any(p.place[0] == "arm" for p in loop.free_parameters),
+        _returned(motion, speed),
     )
+
+
+def _returned(motion: Motion, speed: Float[np.ndarray, " joints"]) -> tuple[float, ...]:
+    """Time by which each joint has moved in both directions in some recording, s; zero if never."""
+    v, t = np.asarray(motion.v), np.asarray(motion.t)
+    v, t = v.reshape(-1, *v.shape[-2:]), t.reshape(-1, t.shape[-1])
+    # First times of each recording in each direction.
+    first = [
+        np.where(s * v > _MOVES * speed, (t - t[:, :1])[..., None], np.inf).min(axis=1)
+        for s in (1, -1)
+    ]
+    both = np.maximum(*first).min(axis=0)
+    return tuple(np.where(np.isfinite(both), both, 0.0).tolist())
 
 
 def _inertia(loop: ClosedLoop, q: Float[np.ndarray, "positions joints"]) -> Float[np.ndarray, "_"]:

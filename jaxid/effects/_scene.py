@@ -22,6 +22,8 @@ class Scene(eqx.Module):
     - `moments`: first moments of each link in its own frame, kg·m; None if not known.
     - `space`: joints and bodies of a spatial arm; None for other arms.
     - `drawn`: whether its bodies are held at the values of a drawing.
+    - `returned`: time by which each joint has moved in both directions in some recording, s; zero
+      if it never does. Empty if not known.
     """
 
     q_low: Float[np.ndarray, " joints"]
@@ -43,6 +45,7 @@ class Scene(eqx.Module):
     couplings: tuple[tuple[int, int, float], ...] = ()
     space: InSpace | None = None
     drawn: bool = False
+    returned: tuple[float, ...] = ()
 
     @property
     def joints(self) -> range:

@@ -1,6 +1,7 @@
 """Friction that depends on more than speed: load, angle, temperature, history."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -94,6 +95,8 @@ class PositionDependentFriction(AbstractEffect):
 
 # A lubricant takes minutes to warm. Torque that fades within a second, s, has another cause.
 _FASTEST = 1.0
+# Share of it that is left when a drift has faded.
+_FADED = 0.1
 
 
 class ThermalDrift(AbstractEffect):
@@ -119,6 +122,16 @@ class ThermalDrift(AbstractEffect):
             for time in scene.duration * np.geomspace(0.06, 1.5, 5)
             if time > _FASTEST
         ]
+
+    def genuine(self, scene: Scene, beside: Sequence[AbstractEffect]) -> bool:
+        """Whether friction still fades when the joint moves in its other direction.
+
+        Otherwise the term may describe another torque at the start of the motion.
+        """
+        if not scene.returned:
+            return True
+        after = scene.returned[self.joint - 1]
+        return math.exp(-after / float(self.time_constant)) > _FADED
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """The fading part of friction on the joint, `(joints,)`."""
