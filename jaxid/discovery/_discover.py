@@ -170,15 +170,16 @@ def _told(
     models = search.visited.weighed(search.at)
     steps = _tested(search, _steps(search, models))
     models = _held_out(search, models, steps)
+    short = _stopped_short(search.asked.most)
     reason = _STOPPED if interrupted else _raised(search, steps)
     if not reason:
         reason = _doubt(search, verdict, steps)
-        if unfinished and reason and steps[-1].fit.status is Status.converged:
-            reason = _stopped_short(search.asked.most)
+        if unfinished and steps[-1].fit.status is Status.converged:
+            reason = short
     if (reason and not interrupted) or verdict == "outside_catalogue":
         # Probabilities assume that one of the examined models is right.
         steps = [s if s.added is None else dataclasses.replace(s, probability=None) for s in steps]
-    elif not unfinished and not reason:
+    elif not reason:
         alike = {named(s.added): s.alike for s in steps if s.added is not None}
         chosen = next((m for m in models if m.key == search.at.key), search.at)
         reason = undecided(models, chosen, alike, search.asked.worth)
@@ -186,8 +187,8 @@ def _told(
         steps = _final(search, steps)
         models = tuple(_as_shown(m, steps[-1]) if m.fit is search.at.fit else m for m in models)
     notes = (*remarks(steps, search.given, search.offsets), *search.failures)
-    if unfinished:
-        notes = (f"stopped at the limit of {search.asked.most} effects: raise most", *notes)
+    if unfinished and reason != short:
+        notes = (short, *notes)
     return Discovery(
         verdict="undetermined" if reason else verdict,
         reason=reason,
@@ -230,7 +231,7 @@ def _as_shown(model: Model, last: Step) -> Model:
 
 
 def _stopped_short(most: int) -> str:
-    """The reason if a model with the largest number of effects fails a test."""
+    """The reason if a further effect would be added to the largest number of effects."""
     return (
         f"a further effect would lower the error, and the search stopped at the limit of {most} "
         f"effect{'s' * (most != 1)}: raise most; many effects together may approximate another law"

@@ -119,11 +119,6 @@ class Discovery(AbstractShown):
                 f"The model of {self.loop.name} describes these recordings down to their noise: "
                 f"nothing is missing{self._sure()}."
             )
-        if self.unfinished:
-            return (
-                f"The model lacked {added}, and is still incomplete: the search was told to stop "
-                "there."
-            )
         if self.verdict == "explained":
             return f"The model lacked {added}; with that, nothing is left to explain."
         lacked = f"The model lacked {added}; " if added else ""
