@@ -14,10 +14,18 @@ from jaxid.discovery.fits import Fits
 from jaxid.discovery.last_tries import replaced
 from jaxid.discovery.models import Model
 from jaxid.discovery.search import Search
-from jaxid.discovery.shapes import _merged, _starts, has_held_shape, shapes_of, with_shapes
+from jaxid.discovery.shapes import (
+    _between_bounds,
+    _merged,
+    _starts,
+    has_held_shape,
+    shapes_of,
+    with_shapes,
+)
 from jaxid.discovery.verify import Refits
 from jaxid.effects import Coulomb, QuadraticDrag, Stribeck
 from jaxid.noise import ARFilter
+from jaxid.parameters import Bounds
 from jaxid.storage.campaign import Campaign
 
 PEAK, SPEED, WIDTH = 1.8, 0.03, 0.004
@@ -119,3 +127,25 @@ def test_a_rival_whose_shape_is_held_is_fitted_with_the_shape_free(ended):
     assert found.score < drag.score - 20
     # Its shape is estimated now, so it is not tried again.
     assert replaced(search, dataclasses.replace(drag, score=found.score - 1.0)) is None
+
+
+@pytest.mark.parametrize("centre", [0.1, 0.5, 1.0])
+def test_deviations_are_at_most_those_between_two_bounds(centre):
+    """Compared with draws of which those beyond the bounds of the first value are left out."""
+    std = np.array([6.2, 0.46, 0.1])
+    correlation = np.array([[1.0, -0.999, 0.0], [-0.999, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    wide = correlation * np.outer(std, std)
+    one = jnp.array([1.0, jnp.inf, jnp.inf])
+    bounds = Bounds(jnp.array([0.0, -jnp.inf, 0.0]), one, jnp.ones(3))
+    found = np.sqrt(np.diag(_between_bounds(wide, bounds)))
+    rng = np.random.default_rng(3)
+    drawn = rng.multivariate_normal([centre, 0.0, 0.0], wide, 200_000)
+    drawn = drawn[(drawn[:, 0] > 0) & (drawn[:, 0] < 1)]
+    spread = drawn.std(axis=0)
+    assert found[0] == pytest.approx(0.5)
+    assert found[2] == pytest.approx(0.1)
+    assert np.all(found > 0.98 * spread)
+    assert np.all(found < 2 * spread)
+    # Values that are certain enough, or that nothing determines, keep their deviations.
+    narrow = np.diag([0.04, np.inf, 0.01])
+    np.testing.assert_array_equal(_between_bounds(narrow, bounds), narrow)

@@ -5,10 +5,11 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from ..effects import AbstractEffect
 from ..estimate import Fit, Status
-from ..parameters import Parameter, list_parameters
+from ..parameters import Bounds, Parameter, list_parameters
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..simulation.widening import LEAD, SIGN
@@ -34,7 +35,8 @@ def with_shapes(fits: Fits, at: Model) -> Fit:
     curve. The deviations of such a fit do not contain the uncertainty of the shape. With the shape
     free, sign and peak of a friction can replace each other, so there may be several minima with
     similar errors. The fit therefore starts from several shapes. Its deviations contain the spread
-    of the minima, weighed by their scores (law of total variance; Madigan and Raftery 1994).
+    of the minima, weighed by their scores (law of total variance; Madigan and Raftery 1994), and no
+    value is less certain than its bounds allow.
 
     Only along an imposed motion, where such fits take seconds.
 
@@ -99,6 +101,7 @@ def _merged(found: Sequence[Fit]) -> Fit:
         for weight, f in zip(share, minima, strict=True)
         if weight > 0
     )
+    covariance = _between_bounds(np.asarray(covariance), Bounds.of(best.loop.free_parameters))
     notes, near = best.notes, int(np.sum(share > _SHOWN))
     if near > 1:
         said = (
@@ -106,7 +109,25 @@ def _merged(found: Sequence[Fit]) -> Fit:
             "given, and deviations contain the distance to the others"
         )
         notes = (*notes, said)
-    return dataclasses.replace(best, covariance=np.asarray(covariance), notes=notes)
+    return dataclasses.replace(best, covariance=covariance, notes=notes)
+
+
+def _between_bounds(
+    covariance: Float[np.ndarray, "parameters parameters"], bounds: Bounds
+) -> Float[np.ndarray, "parameters parameters"]:
+    """A covariance in which no value is less certain than its two bounds allow.
+
+    No distribution between two bounds has a variance above a quarter of their distance squared
+    (Popoviciu 1935). A larger variance is reduced to that, and with it those of correlated values,
+    as by a measurement of the value (Kalman 1960). Values that are not determined at all remain so.
+    """
+    most = (np.asarray(bounds.upper) - np.asarray(bounds.lower)) ** 2 / 4
+    for k, limit in enumerate(most):
+        variance = covariance[k, k]
+        if limit < variance < np.inf:
+            column = covariance[:, k]
+            covariance = covariance - (variance - limit) / variance**2 * np.outer(column, column)
+    return covariance
 
 
 def _same(one: Fit, other: Fit) -> bool:
