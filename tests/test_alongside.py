@@ -28,6 +28,13 @@ def test_many_joints_are_searched_along_the_recorded_motion():
     assert float(continuous.delay) == 0.0
 
 
+def test_loops_with_a_sampled_law_are_searched_along_the_recorded_motion():
+    sampled = dataclasses.replace(scara(), controller=Sampled(scara().controller, every=1e-3))
+    along = along_recorded(sampled)
+    assert isinstance(along.controller, Tracking)
+    assert float(along.controller.delay) == pytest.approx(0.5e-3)
+
+
 @pytest.mark.parametrize(
     "loop",
     [

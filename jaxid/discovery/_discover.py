@@ -70,8 +70,9 @@ def discover(
 
     **Arguments:**
 
-    - `loop`: the starting model. With more than three joints under a known law, sets of effects are
-      compared along the recorded motion, and the loop is simulated at the end; a note says so.
+    - `loop`: the starting model. With more than three joints under a known law, or with a sampled
+      law, sets of effects are compared along the recorded motion, and the loop is simulated at the
+      end; a note says so.
     - `recordings`: recordings to fit. All recordings have one sample rate.
     - `validate`: held-out recordings. They do not enter the score; they test the final model. If
       None, the model is tested on the fitted recordings only.

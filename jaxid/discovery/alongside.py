@@ -1,4 +1,4 @@
-"""Searches along the recorded motion although the law is known, for arms of many joints."""
+"""Searches along the recorded motion although the law is known: many joints, or a sampled law."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,15 +15,17 @@ from .comparison import compare
 
 
 def along_recorded(loop: ClosedLoop) -> ClosedLoop:
-    """The loop in which sets of effects are compared: along the recorded motion if it is large.
+    """The loop in which sets of effects are compared: along the recorded motion if fits are slow.
 
-    One fit of six joints in the simulated loop takes minutes, and a search needs dozens. Below the
-    bandwidth of the law, recorded motion and torque have the same information. The loop is
-    unchanged if it has few joints, if positions are compared, or if its effects have a motion of
-    their own, which only a simulation gives.
+    One fit of six joints in the simulated loop takes minutes, and a search needs dozens. So does a
+    fit under a sampled law of an arm that sticks: a sharp sign of velocity needs up to a hundred
+    steps between two ticks. Below the bandwidth of the law, recorded motion and torque have the
+    same information. The loop is unchanged if it has few joints and a continuous law, if positions
+    are compared, or if its effects have a motion of their own, which only a simulation gives.
     """
     law = loop.controller
-    if loop.joints <= UNROLLED or law.imposes or law.judged != "torque":
+    slow = loop.joints > UNROLLED or law.period is not None
+    if not slow or law.imposes or law.judged != "torque":
         return loop
     along = dataclasses.replace(loop, controller=Tracking(delay=law.lag))
     return along if imposed(along) else loop
@@ -37,8 +39,10 @@ def in_the_loop(loop: ClosedLoop, models: Sequence[ClosedLoop], recordings: Reco
     - `loop`: the given loop, with its law. `models`: loops along the recorded motion, the starting
       model first. `recordings`: held-out recordings, if there are any.
     """
+    large = loop.joints > UNROLLED
+    why = f"{loop.name} has {loop.joints} joints" if large else "the law is sampled"
     said = (
-        f"{loop.name} has {loop.joints} joints, so sets of effects were compared along the "
+        f"{why}, so sets of effects were compared along the "
         "recorded motion, without the law; in the simulated loop the error of the torque on "
         f"{', '.join(recordings.names)}, mean over the joints, is"
     )
