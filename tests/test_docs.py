@@ -1,5 +1,6 @@
 """The documentation builds without a warning, asks nothing of a network, and is complete."""
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -90,6 +91,33 @@ def test_every_effect_of_the_catalogue_is_described_and_drawn() -> None:
         assert f"(`{name}`)" in text
         assert f"(img/effects/{name}.png)" in text
         assert (DOCS / "img" / "effects" / f"{name}.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize("effect", jaxid.catalogue, ids=lambda e: e.__name__)
+def test_tables_of_the_catalogue_have_the_declared_parameters(effect: type) -> None:
+    """Symbol, unit, bounds and kind of each, beside those with several values."""
+    text = (DOCS / "catalogue.md").read_text(encoding="utf-8")
+    (section,) = re.findall(
+        rf"^## \w+ \(`{effect.__name__}`\)\n(.*?)(?=^## |\Z)", text, re.M | re.S
+    )
+    rows = re.findall(r"^\| (.+?) \| `(\w+)` \| (.+?) \| (.*?) \| (\w+)", section, re.M)
+    found = {
+        field: (symbol, unit, bounds.strip(), kind) for symbol, field, unit, bounds, kind in rows
+    }
+    found.pop("rest", None)
+    declared = {}
+    for field in dataclasses.fields(effect):
+        p = field.metadata.get("parameter")
+        if p is None or field.name == "rest":
+            continue
+        low, high = (
+            f"{x / np.pi:g}π" if abs(x) == 2 * np.pi else f"{x:.6g}" for x in (p.lower, p.upper)
+        )
+        bounds = f"{low} to {high}" if np.isfinite(p.upper) else f"≥ {low}"
+        kind = "held" if not p.free else "amplitude" if p.linear else "shape"
+        bounds = bounds if np.isfinite(p.lower) else ""
+        declared[field.name] = p.symbol.rstrip("_"), p.unit, bounds, kind
+    assert found == declared
 
 
 def test_pictures_of_look_alikes_are_there() -> None:

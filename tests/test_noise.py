@@ -1,5 +1,7 @@
 """Noise filters and tests of whiteness, against closed forms and drawn noise."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy import linalg, signal, stats
@@ -16,6 +18,7 @@ from jaxid.noise import (
     ljung_box,
     orders,
 )
+from jaxid.noise.whiteness import levels
 
 FOURTH = ARFilter.from_reflection(np.array([-0.9, 0.8, 0.1, -0.3]), 2.0)
 SECOND = VectorAR(
@@ -195,3 +198,11 @@ def test_what_has_no_filter_is_refused(series, order, says):
         check_series(series, order, "joint 1's torque")
     with pytest.raises(NoiseError, match=says):
         fit_ar(series, order)
+
+
+def test_the_level_of_a_residual_that_overflows_gives_no_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        huge, usual = levels([np.full((5, 1), 1e200), np.ones((5, 1))])
+    assert not np.isfinite(huge).any()
+    assert usual == 0.0

@@ -291,8 +291,8 @@ def _of_motion(found: Fit) -> Float[np.ndarray, "recordings joints"]:
 def _left_percent(found: Fit, percent: "pd.DataFrame") -> Float[np.ndarray, " joints"]:
     """Relative error of each joint over all recordings; NaN for a signal that is zero."""
     errors = percent.to_numpy()
-    left = np.array([np.linalg.norm(r, axis=0) for r in found.residuals])
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        left = np.array([np.linalg.norm(r, axis=0) for r in found.residuals])
         size = np.where(errors > 0, left / errors, 0.0)
         total = np.linalg.norm(left, axis=0) / np.linalg.norm(size, axis=0)
     return np.where(np.isfinite(total), total, 0.0)

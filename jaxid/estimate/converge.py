@@ -315,7 +315,8 @@ def _explains_nothing(done: Converged) -> bool:
     signals = [np.asarray(batch.compared(measured[name])) for name in done.signals]
     signal = np.concatenate(signals, axis=-1)[np.asarray(batch.kept)]
     rest = np.concatenate(residual_series(done))
-    return bool(np.all(np.linalg.norm(rest, axis=0) > np.linalg.norm(signal, axis=0)))
+    with np.errstate(over="ignore"):
+        return bool(np.all(np.linalg.norm(rest, axis=0) > np.linalg.norm(signal, axis=0)))
 
 
 def _at_its_sharpest(done: Converged) -> bool:

@@ -39,9 +39,11 @@ def levelled(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]
 
 def levels(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]:
     """Noise level of each series relative to the overall level; one for a series of zeros."""
-    power = [np.asarray(np.mean(np.square(x), axis=0)) for x in series]
-    pooled = sum(len(x) * p for x, p in zip(series, power, strict=True)) / sum(map(len, series))
-    ratio = [np.where(p > 0, p, 1.0) / np.where(p > 0, pooled, 1.0) for p in power]
+    # The residual of a fit that diverges may overflow.
+    with np.errstate(over="ignore", invalid="ignore"):
+        power = [np.asarray(np.mean(np.square(x), axis=0)) for x in series]
+        pooled = sum(len(x) * p for x, p in zip(series, power, strict=True)) / sum(map(len, series))
+        ratio = [np.where(p > 0, p, 1.0) / np.where(p > 0, pooled, 1.0) for p in power]
     return [np.asarray(np.sqrt(r)) for r in ratio]
 
 
