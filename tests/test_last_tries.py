@@ -1,5 +1,6 @@
 """What a search tries at last: other effects in the place of those it has chosen."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import independent as sim
@@ -12,6 +13,7 @@ import jaxid
 from jaxid.discovery.diagnosis import Diagnosis
 from jaxid.discovery.last_tries import doubtful, replaced, with_transmission
 from jaxid.discovery.models import Model
+from jaxid.discovery.search import Search
 from jaxid.discovery.transmissions import similar_ones, suspected
 from jaxid.discovery.verify import Refits, held_shapes
 from jaxid.effects import (
@@ -23,18 +25,24 @@ from jaxid.effects import (
     TorqueSaturation,
 )
 
+OFFSET = (TorqueOffset(joint=2, level=0.01),)
+
+
+def with_a_weak_spring(case, story) -> tuple[Search, Model, Model]:
+    """A search of an offset, its start, and the fit of a weak spring in the offset's place."""
+    search, start = search_of(case), story[0].steps[0]
+    without = search.visit((), start.fit)
+    last = with_chain(case, start, Spring(joint=2, stiffness=0.01))[-1].fit
+    return search, without, search.visit(search.added(last), last)
+
 
 @pytest.mark.xdist_group("offset")
 def test_a_close_rival_that_was_only_predicted_is_fitted(offset_case, offset_story):
     """A weak spring in the place of the offset; the prediction puts the offset slightly behind."""
-    search, start = search_of(offset_case), offset_story[0].steps[0]
-    search.visit((), start.fit)
-    last = with_chain(offset_case, start, Spring(joint=2, stiffness=0.01))[-1].fit
-    at = search.visit(search.added(last), last)
-    offset = (TorqueOffset(joint=2, level=0.01),)
-    search.visited.add(Model(offset, at.score + 20.0, noise=at.noise, beyond=1))
+    search, _, at = with_a_weak_spring(offset_case, offset_story)
+    search.visited.add(Model(OFFSET, at.score + 20.0, noise=at.noise, beyond=1))
     assert replaced(search, at) is None
-    search.visited.add(Model(offset, at.score + 5.0, noise=at.noise, beyond=1))
+    search.visited.add(Model(OFFSET, at.score + 5.0, noise=at.noise, beyond=1))
     found = replaced(search, at)
     assert found is not None
     assert found.names == (("torque_offset", 2),)
@@ -49,13 +57,9 @@ def test_a_rival_whose_fit_is_worse_than_that_of_a_part_is_fitted_again(
     worse, offset_case, offset_story
 ):
     """The fit without the effect has a lower score, so that with it is not at its minimum."""
-    search, start = search_of(offset_case), offset_story[0].steps[0]
-    without = search.visit((), start.fit)
-    last = with_chain(offset_case, start, Spring(joint=2, stiffness=0.01))[-1].fit
-    at = search.visit(search.added(last), last)
-    offset = (TorqueOffset(joint=2, level=0.01),)
+    search, without, at = with_a_weak_spring(offset_case, offset_story)
     score = without.score + worse if worse else at.score + 5.0
-    search.visited.add(Model(offset, score, fit=last, noise=at.noise))
+    search.visited.add(Model(OFFSET, score, fit=at.fit, noise=at.noise))
     found = replaced(search, at)
     assert (found is not None) == bool(worse)
     if found is not None:
@@ -66,20 +70,21 @@ def test_a_rival_whose_fit_is_worse_than_that_of_a_part_is_fitted_again(
 @pytest.mark.xdist_group("offset")
 def test_a_predicted_model_that_makes_an_effect_doubtful_is_fitted(offset_case, offset_story):
     """Without the spring, and with weight: the offset is better, a second spring has no value."""
-    search, start = search_of(offset_case), offset_story[0].steps[0]
-    search.visit((), start.fit)
-    last = with_chain(offset_case, start, Spring(joint=2, stiffness=0.01))[-1].fit
-    at = search.visit(search.added(last), last)
-    offset = (TorqueOffset(joint=2, level=0.01),)
-    search.visited.add(Model(offset, at.score + 20.0, noise=at.noise, beyond=1))
+    search, _, at = with_a_weak_spring(offset_case, offset_story)
+    search.visited.add(Model(OFFSET, at.score + 20.0, noise=at.noise, beyond=1))
     assert doubtful(search, at) is None
     pair = Model(
-        (*offset, Spring(joint=1, stiffness=0.01)), at.score - 5.0, noise=at.noise, beyond=2
+        (*OFFSET, Spring(joint=1, stiffness=0.01)), at.score - 5.0, noise=at.noise, beyond=2
     )
     search.visited.add(pair)
+    asked = search.asked
+    search.asked = dataclasses.replace(asked, most=1)
+    assert doubtful(search, at) is None
+    assert pair.key in [m.key for m in search.visited.ranked()]
+    search.asked = asked
     assert doubtful(search, at) is None
     assert pair.key not in [m.key for m in search.visited.ranked()]
-    search.visited.add(Model(offset, at.score + 5.0, noise=at.noise, beyond=1))
+    search.visited.add(Model(OFFSET, at.score + 5.0, noise=at.noise, beyond=1))
     found = doubtful(search, at)
     assert found is not None
     assert found.names == (("torque_offset", 2),)

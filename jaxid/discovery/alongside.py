@@ -42,8 +42,8 @@ def in_the_loop(loop: ClosedLoop, models: Sequence[ClosedLoop], recordings: Reco
     large = loop.joints > UNROLLED
     why = f"{loop.name} has {loop.joints} joints" if large else "the law is sampled"
     said = (
-        f"{why}, so sets of effects were compared along the "
-        "recorded motion, without the law; in the simulated loop the error of the torque on "
+        f"{why}, so sets of effects were compared along the recorded motion, without the law; in "
+        "the simulated loop the error of the torque on "
         f"{', '.join(recordings.names)}, mean over the joints, is"
     )
     try:

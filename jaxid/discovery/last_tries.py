@@ -111,10 +111,10 @@ def doubtful(search: Examined, at: Model) -> Model | None:
     fitted, or if the recordings determine no value of one of its effects.
     """
     assert at.fit is not None
-    best, own = at, set(at.names)
+    best, own, most = at, set(at.names), search.asked.most
 
     def contradicts(m: Model) -> bool:
-        alone = m.fit is None and m.curve is None
+        alone = m.fit is None and m.curve is None and len(m.effects) <= most
         return alone and bool(own - set(m.names)) and bool(m.score < best.score + LIKELY)
 
     for _ in range(_DOUBTS):
@@ -124,16 +124,12 @@ def doubtful(search: Examined, at: Model) -> Model | None:
         again = partial(search.fits.exchanged, at.fit.loop, at.effects, rival.effects, rival.noise)
         found = _better(search, best, rival.effects, again)
         fitted = search.visited.fitted(rival.effects)
-        if fitted is None or undetermined(_fit_of(fitted), len(rival.effects)):
+        fit = None if fitted is None else fitted.fit
+        if fit is None or undetermined(fit, len(rival.effects)):
             search.visited.drop(rival.key)
         else:
             best = found
     return None if best is at else best
-
-
-def _fit_of(model: Model) -> Fit:
-    assert model.fit is not None
-    return model.fit
 
 
 def with_transmission(search: Examined, at: Model) -> Model | None:
