@@ -75,15 +75,7 @@ class Chain(eqx.Module):
         """
         turns, places, axes = self.frames(q)
         turning, sliding = self._apart(axes)
-        rate = jnp.cumsum(turning * v[:, None], axis=0)
-        still = np.zeros((1, 3))
-        before = jnp.concatenate([still, rate[:-1]])
-        spin = jnp.cumsum(turning * a[:, None] + jnp.cross(before, turning * v[:, None]), axis=0)
-        before_spin = jnp.concatenate([still, spin[:-1]])
-        arm = jnp.diff(places, axis=0, prepend=still)
-        moved = jnp.cross(before_spin, arm) + jnp.cross(before, jnp.cross(before, arm))
-        along = sliding * a[:, None] + 2 * jnp.cross(before, sliding * v[:, None])
-        lift = jnp.cumsum(moved + along, axis=0) - self.gravity
+        rate, spin, lift = self._moving(places, axes, v, a)
         inertia, moment, mass = _in_base(bodies, turns)
         force = mass * lift + jnp.cross(spin, moment) + jnp.cross(rate, jnp.cross(rate, moment))
         momentum = jnp.einsum("kij,kj->ki", inertia, rate)
@@ -97,6 +89,52 @@ class Chain(eqx.Module):
         about_base = jnp.cumsum(torque[::-1], axis=0)[::-1]
         at_joint = about_base - jnp.cross(places, beyond)
         return jnp.sum(turning * at_joint + sliding * beyond, axis=1)
+
+    def _moving(
+        self,
+        places: Float[Array, "joints 3"],
+        axes: Float[Array, "joints 3"],
+        v: Float[Array, " joints"],
+        a: Float[Array, " joints"],
+    ) -> tuple[Float[Array, "joints 3"], Float[Array, "joints 3"], Float[Array, "joints 3"]]:
+        """Angular velocity and acceleration of each link, and its origin's acceleration minus
+        gravity, in the base's frame."""
+        turning, sliding = self._apart(axes)
+        rate = jnp.cumsum(turning * v[:, None], axis=0)
+        still = np.zeros((1, 3))
+        before = jnp.concatenate([still, rate[:-1]])
+        spin = jnp.cumsum(turning * a[:, None] + jnp.cross(before, turning * v[:, None]), axis=0)
+        before_spin = jnp.concatenate([still, spin[:-1]])
+        arm = jnp.diff(places, axis=0, prepend=still)
+        moved = jnp.cross(before_spin, arm) + jnp.cross(before, jnp.cross(before, arm))
+        along = sliding * a[:, None] + 2 * jnp.cross(before, sliding * v[:, None])
+        lift = jnp.cumsum(moved + along, axis=0) - self.gravity
+        return rate, spin, lift
+
+    def regressor(
+        self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
+    ) -> Float[Array, "joints parameters"]:
+        """Derivative of `inverse` by the bodies, `BODY` of one link after the other, SI units.
+
+        **Arguments:** as for `inverse`.
+        """
+        turns, places, axes = self.frames(q)
+        rate, spin, lift = (
+            jnp.einsum("kji,kj->ki", turns, x) for x in self._moving(places, axes, v, a)
+        )
+        cross = jax.vmap(_cross_matrix)
+        across, about, fall = cross(rate), cross(spin), cross(lift)
+        inertia = _by_inertia(spin) + across @ _by_inertia(rate)
+        moment = jnp.concatenate([inertia, -fall, np.zeros((self.joints, 3, 1))], axis=2)
+        moved = about + across @ across
+        none = np.zeros((self.joints, 3, 6))
+        force = turns @ jnp.concatenate([none, moved, lift[:, :, None]], axis=2)
+        moment = turns @ moment + cross(places) @ force
+        turning, passing = self._screws(places, axes)
+        rows = jnp.einsum("ji,kip->jkp", turning, moment)
+        rows = rows + jnp.einsum("ji,kip->jkp", passing, force)
+        carried = np.triu(np.ones((self.joints,) * 2))[:, :, None]
+        return (rows * carried).reshape(self.joints, -1)
 
     def _apart(
         self, axes: Float[Array, "joints 3"]
@@ -193,6 +231,49 @@ def moved_body(body: Float[Array, "10"], place: Float[Array, "3"]) -> Float[Arra
     both = jnp.outer(place, moment) + jnp.outer(moment, place) + mass * jnp.outer(place, place)
     shift = jnp.trace(both) * jnp.eye(3) - both
     return jnp.concatenate([body[:6] + shift[jnp.triu_indices(3)], moment + mass * place, body[9:]])
+
+
+@eqx.filter_custom_jvp
+def inverse_by_rows(
+    chain: Chain,
+    bodies: Float[Array, "joints 10"],
+    q: Float[Array, " joints"],
+    v: Float[Array, " joints"],
+    a: Float[Array, " joints"],
+) -> Float[Array, " joints"]:
+    """`Chain.inverse`, with derivatives by its regressor.
+
+    Many tangents of the bodies are then one product of matrices. Not for a simulation's loop, whose
+    kernel has scalars only.
+    """
+    return chain.inverse(bodies, q, v, a)
+
+
+@inverse_by_rows.def_jvp
+def _inverse_by_rows_jvp(primals, tangents):
+    chain, bodies, q, v, a = primals
+    d_chain, d_bodies, d_q, d_v, d_a = tangents
+    tau, change = chain.inverse(bodies, q, v, a), jnp.zeros_like(q)
+    if d_bodies is not None:
+        change = change + chain.regressor(q, v, a) @ d_bodies.reshape(-1)
+    if d_q is not None or d_v is not None:
+        for slope, along in zip(chain.inverse_slopes(bodies, q, v, a), (d_q, d_v), strict=True):
+            if along is not None:
+                change = change + slope @ along
+    if d_a is not None:
+        change = change + chain.mass_matrix(bodies, q) @ d_a
+    if jax.tree.leaves(d_chain):
+        _, by_chain = eqx.filter_jvp(lambda x: x.inverse(bodies, q, v, a), (chain,), (d_chain,))
+        change = change + by_chain
+    return tau, change
+
+
+def _by_inertia(x: Float[Array, "joints 3"]) -> Float[Array, "joints 3 6"]:
+    """The matrices that map moments of inertia, XX to ZZ, to the inertia times a vector."""
+    x, y, z = x[:, 0], x[:, 1], x[:, 2]
+    o = jnp.zeros_like(x)
+    rows = ((x, y, z, o, o, o), (o, x, o, y, z, o), (o, o, x, o, y, z))
+    return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
 
 
 def _cross_matrix(x: Float[Array | np.ndarray, "3"]) -> Float[Array, "3 3"]:

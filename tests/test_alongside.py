@@ -1,17 +1,21 @@
-"""Searches along the recorded motion, for arms of many joints under a known law."""
+"""Searches along the recorded motion although the law is known."""
 
 import dataclasses
 import re
 
+import independent as sim
 import numpy as np
 import pytest
+from independent import effects as fx
 from loops import four_joints, scara
+from stories import recordings_of
 
 import jaxid
+from jaxid import Stepping
 from jaxid.control import PD, OpenLoop, Sampled, Tracking
 from jaxid.discovery import alongside
 from jaxid.discovery.alongside import along_recorded, in_the_loop
-from jaxid.effects import JointElasticity
+from jaxid.effects import JointElasticity, TorqueOffset
 
 LAW = PD(Kp=[800.0, 600.0, 3000.0, 90.0], Kv=[80.0, 60.0, 300.0, 9.0])
 
@@ -33,6 +37,21 @@ def test_loops_with_a_sampled_law_are_searched_along_the_recorded_motion():
     along = along_recorded(sampled)
     assert isinstance(along.controller, Tracking)
     assert float(along.controller.delay) == pytest.approx(0.5e-3)
+
+
+def test_loops_that_need_many_steps_are_searched_along_the_recorded_motion():
+    assert isinstance(along_recorded(scara(stepping=Stepping(substeps=17))).controller, Tracking)
+    assert along_recorded(scara(stepping=Stepping(substeps=16))).controller.judged == "torque"
+
+
+def test_a_search_continues_along_the_recorded_motion_if_the_first_fit_needs_many_steps():
+    case = sim.make_case(5, effects=[fx.TorqueOffset(joint=1, torque=0.1)], duration=8.0)
+    fit, held_out = recordings_of(case)
+    loop = dataclasses.replace(jaxid.scara(), stepping=Stepping(substeps=17))
+    found = jaxid.discover(loop, fit, held_out, catalogue=[TorqueOffset], progress=False)
+    assert [s.label for s in found.steps] == ["start", "+ torque_offset on joint 1"]
+    assert all(isinstance(s.fit.loop.controller, Tracking) for s in found.steps)
+    assert any("the starting model needs more than 16 steps" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,13 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxid
 from jaxid.arms import SerialArm
+from jaxid.chain import inverse_by_rows
 from jaxid.effects import Counterbalance, SharedShaft
 from jaxid.errors import ModelError
 
@@ -126,6 +128,29 @@ def test_torque_inertia_and_regressor_are_pinocchios(described):
     np.testing.assert_allclose(regressor, by_bodies, rtol=0, atol=1e-12 * largest)
     # What drawings round to is left out of the combinations.
     np.testing.assert_allclose(regressor @ np.asarray(arm.base), expected, atol=1e-7 * size)
+
+
+def test_derivatives_by_rows_are_those_of_the_equations():
+    arm, rng = SerialArm.from_urdf(POLAR), np.random.default_rng(3)
+    at = (arm.chain, arm.inertias(), *jnp.asarray(rng.normal(size=(3, 2))))
+    tangents = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=np.shape(x))), at)
+
+    def equations(chain, *motion):
+        return chain.inverse(*motion)
+
+    theirs = eqx.filter_jvp(equations, at, tangents)
+    ours = eqx.filter_jvp(inverse_by_rows, at, tangents)
+    np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-12)
+    np.testing.assert_allclose(ours[1], theirs[1], rtol=1e-12)
+    # What is held has no tangent.
+    for k in range(1, 5):
+        only = [None] * 5
+        only[k] = tangents[k]
+        one, other = (
+            eqx.filter_jvp(lambda x, f=f, k=k: f(*at[:k], x, *at[k + 1 :]), (at[k],), (only[k],))
+            for f in (inverse_by_rows, equations)
+        )
+        np.testing.assert_allclose(one[1], other[1], rtol=1e-11, atol=1e-12)
 
 
 def test_torque_is_mujocos(tmp_path):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..chain import BODY, Chain, InSpace, moved_body
+from ..chain import BODY, Chain, InSpace, inverse_by_rows, moved_body
 from ..errors import ModelError
 from ..parameters import KNOWN, Vector, as_float64, parameter
 from ._base import AbstractArm
@@ -154,13 +154,13 @@ class SerialArm(AbstractArm):
         self, q: Float[Array, " joints"], v: Float[Array, " joints"]
     ) -> Float[Array, " joints"]:
         """Coriolis, centrifugal and gravity torque, `(joints,)`, N·m or N."""
-        return self.inverse(q, v, jnp.zeros_like(q))
+        return self.chain.inverse(self.inertias(), q, v, jnp.zeros_like(q))
 
     def inverse(
         self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
     ) -> Float[Array, " joints"]:
         """Torque needed for a motion, `(joints,)`, N·m or N, without forming the inertia matrix."""
-        return self.chain.inverse(self.inertias(), q, v, a)
+        return inverse_by_rows(self.chain, self.inertias(), q, v, a)
 
     def inverse_slopes(
         self, q: Float[Array, " joints"], v: Float[Array, " joints"], a: Float[Array, " joints"]
@@ -340,9 +340,5 @@ def _regressor(
     rng = np.random.default_rng(0)
     q = rng.uniform(lower, upper, (20 * n, n))
     v, a = rng.normal(size=(2, 20 * n, n))
-    # Torque is linear in the bodies' parameters, so its derivative is constant.
-    by_bodies = jax.vmap(
-        jax.jacfwd(lambda bodies, *at: chain.inverse(bodies, *at)), (None, 0, 0, 0)
-    )
-    rows = jax.jit(by_bodies)(jnp.zeros((n, 10)), q, v, a)
+    rows = jax.jit(jax.vmap(chain.regressor))(q, v, a)
     return np.asarray(rows).reshape(-1, 10 * n), a

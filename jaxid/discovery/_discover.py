@@ -14,6 +14,7 @@ from ..errors import FitError
 from ..estimate import OEM, Status
 from ..estimate.standstill import slow_note, worst_at_standstill
 from ..recording import Recording, Recordings
+from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..simulation.sharing import with_one_blas_thread
 from ..storage.campaign import Campaign
@@ -70,9 +71,9 @@ def discover(
 
     **Arguments:**
 
-    - `loop`: the starting model. With more than three joints under a known law, or with a sampled
-      law, sets of effects are compared along the recorded motion, and the loop is simulated at the
-      end; a note says so.
+    - `loop`: the starting model. With more than three joints under a known law, with a sampled
+      law, or if its friction is so sharp that simulations are slow, sets of effects are compared
+      along the recorded motion, and the loop is simulated at the end; a note says so.
     - `recordings`: recordings to fit. All recordings have one sample rate.
     - `validate`: held-out recordings. They do not enter the score; they test the final model. If
       None, the model is tested on the fitted recordings only.
@@ -115,9 +116,11 @@ def discover(
             resume, {"loop": loop, "search": asked.plan()}, classes_of(loop) | asked.classes()
         ) as campaign,
     ):
-        searched = along_recorded(loop)
-        story = _with_and_without_standstill(asked, campaign, say, searched, progress, started)
-        if searched is loop or story.interrupted or story.fit.mistake:
+        story = _with_and_without_standstill(
+            asked, campaign, say, along_recorded(loop), progress, started
+        )
+        simulated = imposed(loop) or not imposed(story.fit.loop)
+        if simulated or story.interrupted or story.fit.mistake:
             return story
         say("simulation of the loop")
         models = [step.fit.loop for step in story.steps]

@@ -1,4 +1,4 @@
-"""Searches along the recorded motion although the law is known: many joints, or a sampled law."""
+"""Searches along the recorded motion although the law is known, because simulations are slow."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,13 +18,15 @@ def along_recorded(loop: ClosedLoop) -> ClosedLoop:
     """The loop in which sets of effects are compared: along the recorded motion if fits are slow.
 
     One fit of six joints in the simulated loop takes minutes, and a search needs dozens. So does a
-    fit under a sampled law of an arm that sticks: a sharp sign of velocity needs up to a hundred
-    steps between two ticks. Below the bandwidth of the law, recorded motion and torque have the
-    same information. The loop is unchanged if it has few joints and a continuous law, if positions
-    are compared, or if its effects have a motion of their own, which only a simulation gives.
+    fit of an arm that sticks: a sharp sign of velocity needs up to a hundred steps between two
+    samples or ticks. A sampled law is slow from the start; under a continuous law, the fit of the
+    starting model shows whether its loop needs that many. Below the bandwidth of the law, recorded
+    motion and torque have the same information. The loop is unchanged if positions are compared, or
+    if its effects have a motion of their own, which only a simulation gives.
     """
     law = loop.controller
-    slow = loop.joints > UNROLLED or law.period is not None
+    short = (loop.stepping.substeps or 1) > _STEPS
+    slow = loop.joints > UNROLLED or law.period is not None or short
     if not slow or law.imposes or law.judged != "torque":
         return loop
     along = dataclasses.replace(loop, controller=Tracking(delay=law.lag))
@@ -39,8 +41,12 @@ def in_the_loop(loop: ClosedLoop, models: Sequence[ClosedLoop], recordings: Reco
     - `loop`: the given loop, with its law. `models`: loops along the recorded motion, the starting
       model first. `recordings`: held-out recordings, if there are any.
     """
-    large = loop.joints > UNROLLED
-    why = f"{loop.name} has {loop.joints} joints" if large else "the law is sampled"
+    if loop.joints > UNROLLED:
+        why = f"{loop.name} has {loop.joints} joints"
+    elif loop.controller.period is not None:
+        why = "the law is sampled"
+    else:
+        why = f"the starting model needs more than {_STEPS} steps between two samples"
     said = (
         f"{why}, so sets of effects were compared along the recorded motion, without the law; in "
         "the simulated loop the error of the torque on "

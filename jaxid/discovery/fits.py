@@ -29,12 +29,16 @@ class Fits:
     def __init__(self, refits: Refits, campaign: Campaign, prefix: str = "") -> None:
         self._refits, self._campaign, self._prefix = refits, campaign, prefix
 
-    def start(self, loop: ClosedLoop) -> Fit:
+    def start(self, loop: ClosedLoop, name: str = "start") -> Fit:
         """The fit of the starting model.
 
         A recording along which it diverges is left out from here on.
+
+        **Arguments:**
+
+        - `name`: under which it is saved.
         """
-        first = self._campaign.piece(f"{self._prefix}start", lambda: self._refits.first(loop))
+        first = self._campaign.piece(f"{self._prefix}{name}", lambda: self._refits.first(loop))
         error = over_recordings(first.error_percent.to_numpy()) if first.status.simulated else None
         self._refits = dataclasses.replace(self._refits, recordings=first.recordings, before=error)
         return first

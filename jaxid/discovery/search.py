@@ -13,6 +13,7 @@ from ..estimate import Fit
 from ..noise import ARFilter
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
+from .alongside import along_recorded
 from .diagnosis import Diagnosis, over_recordings, share_left
 from .examined import Examined
 from .explore import DECISIVE, Candidate, explore, key_of, largest_first
@@ -101,6 +102,10 @@ class Search(Examined):
         """The starting model, fitted with noise filters."""
         self.watched.begin("fit", "fit of the starting model")
         first = self.fits.start(loop)
+        along = along_recorded(first.loop)
+        if along is not first.loop:
+            self.given = loop = dataclasses.replace(loop, controller=along.controller)
+            first = self.fits.start(loop, "start along the recorded motion")
         screened, diagnosis = self._screened(first, ())
         if first.mistake:
             # Effects would only approximate the mistake.
