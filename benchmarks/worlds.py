@@ -105,7 +105,8 @@ def judge(
     sure = story["verdict"] in ("adequate", "explained")
     marks: dict[str, Any] = {"verdict": story["verdict"], "ratio": ratio, "sure": sure}
     if law == "continuous":
-        marks["sampling_named"] = len(added) < len(story["added"])
+        said = ("like a law that is sampled", "as if it is held from one sample to the next")
+        marks["sampling_named"] = any(text in note for note in story["notes"] for text in said)
     if kind == "clean":
         return {**marks, "right": sure and not groups, "alarm": bool(groups)}
     if kind == "outside":
