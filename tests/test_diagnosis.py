@@ -10,9 +10,9 @@ import pytest
 from stories import Bump
 
 import jaxid
-from jaxid.discovery.hypotheses import candidates, survey
+from jaxid.discovery.hypotheses import _inertia, candidates, survey
 from jaxid.discovery.score import Gram, _root, corrected, effective_tests
-from jaxid.effects import Curve, Motion, TorqueOffset
+from jaxid.effects import Curve, Motion, RotorInertia, TorqueOffset
 
 
 @pytest.mark.xdist_group("offset")
@@ -101,6 +101,18 @@ def test_a_joint_that_is_held_still_has_shapes_to_screen():
     assert {getattr(e, "joint", 2) for e in settings} == {1, 2}
     for effect in settings:
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(effect)), effect
+
+
+def test_the_inertia_of_a_joint_includes_its_rotor():
+    q = np.stack([np.linspace(0, 1, 50), np.linspace(-1, 1, 50)], axis=1)
+    loop = jaxid.scara()
+    bare = _inertia(loop, q)
+    # A heavy rotor holds its joint, so the other one feels its own inertia only.
+    whole = _inertia(loop.add(RotorInertia(joint=2, inertia=1e6)), q)
+    mass = np.asarray([loop.arm.mass_matrix(jnp.asarray(x)) for x in q])
+    np.testing.assert_allclose(whole[1], 1e6, rtol=1e-3)
+    np.testing.assert_allclose(whole[0], mass[:, 0, 0].mean(), rtol=0.02)
+    assert bare[0] < whole[0]
 
 
 def test_a_diagnosis_begins_where_its_fit_did():

@@ -196,7 +196,11 @@ def test_an_elasticity_takes_the_place_of_a_narrow_gap():
 
 def test_a_late_drive_may_be_a_soft_joint(offset_case):
     asked = search_of(offset_case).asked
-    soft, late = JointElasticity(joint=2, compliance=1e-3), TimeDelay(joint=2, delay=0.01)
+    period = asked.recordings.common_period()
+    soft, late = JointElasticity(joint=2, compliance=1e-3), TimeDelay(joint=2, delay=2 * period)
     screened = (soft, JointElasticity(joint=1), Spring(joint=2))
     pairs = similar_ones((late, TorqueOffset(joint=2)), asked, screened)
     assert [(id(a), id(b)) for a, b in pairs] == [(id(late), id(soft))]
+    # As late as a law that is sampled with the recordings and held.
+    held = dataclasses.replace(late, delay=0.5 * period)
+    assert not list(similar_ones((held,), asked, screened))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import AbstractEffect, Curve, Motion, Scene, check_declared
+from ..effects import AbstractEffect, Curve, Motion, RotorInertia, Scene, check_declared
 from ..effects import catalogue as known
 from ..effects.curve import curve_over
 from ..errors import FitError, ModelError
@@ -122,8 +122,13 @@ def _returned(motion: Motion, speed: Float[np.ndarray, " joints"]) -> tuple[floa
 def _inertia(loop: ClosedLoop, q: Float[np.ndarray, "positions joints"]) -> Float[np.ndarray, "_"]:
     """Inertia of each joint while the others are free to move, averaged over positions."""
     mass = mass_matrices(loop.arm, q)
-    # Rotors are effects: without them a wrist with drawn bodies may have almost no inertia.
-    mass = mass + 1e-6 * np.trace(mass, axis1=1, axis2=2)[:, None, None] * np.eye(loop.joints)
+    rotors = np.zeros(loop.joints)
+    for effect in loop.effects:
+        if isinstance(effect, RotorInertia):
+            rotors[effect.joint - 1] += float(effect.inertia)
+    # A wrist with drawn bodies and no rotor may have almost no inertia.
+    least = 1e-6 * np.trace(mass, axis1=1, axis2=2)[:, None, None]
+    mass = mass + (rotors + least) * np.eye(loop.joints)
     try:
         freed = np.linalg.inv(mass)
     except np.linalg.LinAlgError as error:

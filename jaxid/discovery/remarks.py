@@ -142,8 +142,7 @@ def looks_sampled(fit: Fit) -> list[str]:
         return []
     period, found = fit.recordings.common_period(), []
     for effect in fit.loop.effects:
-        late = {ActuatorLag: "time_constant", TimeDelay: "delay"}.get(type(effect))
-        value = 0.0 if late is None else float(getattr(effect, late))
+        value = float(effect.late) if isinstance(effect, (ActuatorLag, TimeDelay)) else 0.0
         joint = getattr(effect, "joint", "")
         if _HELD[0] * period < value < _HELD[1] * period:
             found.append(

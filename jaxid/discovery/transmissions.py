@@ -45,14 +45,15 @@ def similar_ones(
 
     An elasticity resembles a gap as wide as its twist under load, and a gap that is narrower than
     the twist an elasticity. A soft joint, beyond what screening simulates, first resembles a late
-    drive.
+    drive. A drive that is late by less than a sample is like a law that is sampled and held.
 
     **Arguments:**
 
     - `screened`: screened effects at their best settings.
     """
+    period = min(r.period for r in asked.recordings)
     for effect in effects:
-        if isinstance(effect, (ActuatorLag, TimeDelay)):
+        if isinstance(effect, (ActuatorLag, TimeDelay)) and effect.late > period:
             for other in screened:
                 if isinstance(other, AbstractTransmission) and other.joint == effect.joint:
                     yield effect, other

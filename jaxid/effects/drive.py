@@ -33,6 +33,11 @@ class ActuatorLag(AbstractEffect):
         0.0, symbol="Tlag", unit="s", lower=0.0, scale=0.01, linear=False
     )
 
+    @property
+    def late(self) -> Float[Array, ""]:
+        """Time by which slow torques follow their command, s."""
+        return self.time_constant
+
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["ActuatorLag"]:
         """One small lag for each joint; its size is estimated in the refit."""
@@ -72,6 +77,11 @@ class TimeDelay(AbstractEffect):
     joint_fields = ("joint",)
     joint: int = eqx.field(static=True)
     delay: Scalar = parameter(0.0, symbol="delay", unit="s", lower=0.0, scale=0.01, linear=False)
+
+    @property
+    def late(self) -> Float[Array, ""]:
+        """Time by which torques follow their command, s."""
+        return self.delay
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["TimeDelay"]:
