@@ -77,8 +77,8 @@ def _error(given: ClosedLoop, found: ClosedLoop, recordings: Recordings) -> floa
     return float(compare(loop, recordings).error_percent.to_numpy().mean())
 
 
-# Steps between two grid points that a simulation may need, and shares of a joint's highest speed to
-# which the smoothing of its signs is raised for that.
+# Steps between two grid points up to which a simulation is fast enough, and shares of a joint's
+# highest speed to which the smoothing of its signs is raised for that.
 _STEPS, _SHARES = 16, np.geomspace(1e-6, 1e-1, 11)
 
 

@@ -104,6 +104,7 @@ class Search(Examined):
         first = self.fits.start(loop)
         along = along_recorded(first.loop)
         if along is not first.loop:
+            # The fit has shown that each simulation needs many steps.
             self.given = loop = dataclasses.replace(loop, controller=along.controller)
             first = self.fits.start(loop, "start along the recorded motion")
         screened, diagnosis = self._screened(first, ())

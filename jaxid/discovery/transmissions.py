@@ -51,7 +51,7 @@ def similar_ones(
 
     - `screened`: screened effects at their best settings.
     """
-    period = min(r.period for r in asked.recordings)
+    period = asked.recordings.common_period()
     for effect in effects:
         if isinstance(effect, (ActuatorLag, TimeDelay)) and effect.late > period:
             for other in screened:
