@@ -146,7 +146,8 @@ def _with_and_without_standstill(
     if slower is None:
         return story
     say("the same without standstill, which the model describes worst")
-    moving = dataclasses.replace(loop, standstill=slower)
+    # Along the recorded motion, if the first search went on there.
+    moving = dataclasses.replace(search.given, standstill=slower)
     search = Search(asked, campaign, say, live_figure(progress), prefix="moving, ")
     try:
         story = _searched(search, moving, started)
