@@ -14,7 +14,7 @@ import jaxid
 from jaxid import Stepping
 from jaxid.control import PD, OpenLoop, Sampled, Tracking
 from jaxid.discovery import alongside
-from jaxid.discovery.alongside import along_recorded, in_the_loop
+from jaxid.discovery.alongside import along_recorded, in_the_loop, sampled_law
 from jaxid.effects import JointElasticity, TorqueOffset
 
 LAW = PD(Kp=[800.0, 600.0, 3000.0, 90.0], Kv=[80.0, 60.0, 300.0, 9.0])
@@ -39,19 +39,41 @@ def test_loops_with_a_sampled_law_are_searched_along_the_recorded_motion():
     assert float(along.controller.delay) == pytest.approx(0.5e-3)
 
 
-def test_loops_that_need_many_steps_are_searched_along_the_recorded_motion():
-    assert isinstance(along_recorded(scara(stepping=Stepping(substeps=17))).controller, Tracking)
-    assert along_recorded(scara(stepping=Stepping(substeps=16))).controller.judged == "torque"
+OFFSET = fx.TorqueOffset(joint=1, torque=0.1)
 
 
-def test_a_search_continues_along_the_recorded_motion_if_the_first_fit_needs_many_steps():
-    case = sim.make_case(5, effects=[fx.TorqueOffset(joint=1, torque=0.1)], duration=8.0)
+@pytest.mark.parametrize(
+    ("substeps", "law", "why"),
+    [
+        (17, sim.PD(), "needs more than 16 steps"),
+        (None, sim.SampledPD(period=0.01), "like a law that is sampled"),
+    ],
+)
+def test_a_search_continues_along_the_recorded_motion_after_the_first_fit(substeps, law, why):
+    case = sim.make_case(5, effects=[OFFSET], duration=8.0, controller=law)
     fit, held_out = recordings_of(case)
-    loop = dataclasses.replace(jaxid.scara(), stepping=Stepping(substeps=17))
+    loop = dataclasses.replace(jaxid.scara(), stepping=Stepping(substeps=substeps))
     found = jaxid.discover(loop, fit, held_out, catalogue=[TorqueOffset], progress=False)
     assert [s.label for s in found.steps] == ["start", "+ torque_offset on joint 1"]
     assert all(isinstance(s.fit.loop.controller, Tracking) for s in found.steps)
-    assert any("the starting model needs more than 16 steps" in note for note in found.notes)
+    assert any(why in note for note in found.notes)
+    assert any("in the simulated loop the error" in note for note in found.notes)
+
+
+def test_drives_are_late_under_a_sampled_law():
+    late = sampled_law(fitted(effects=[OFFSET], controller=sim.SampledPD(period=0.01)))
+    assert late == pytest.approx([5e-3, 5e-3], rel=0.3)
+
+
+@pytest.mark.parametrize("effects", [[], [OFFSET], [fx.TimeDelay(joint=1, delay=5e-3)]])
+def test_a_single_late_drive_is_no_sampled_law(effects):
+    assert sampled_law(fitted(effects=effects)) == ()
+
+
+def fitted(**case) -> jaxid.Fit:
+    """The fit of a SCARA under a continuous law to two simulations."""
+    recordings, _ = recordings_of(sim.make_case(5, duration=8.0, **case))
+    return jaxid.fit(jaxid.scara(), recordings)
 
 
 @pytest.mark.parametrize(

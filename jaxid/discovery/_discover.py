@@ -72,8 +72,9 @@ def discover(
     **Arguments:**
 
     - `loop`: the starting model. With more than three joints under a known law, with a sampled
-      law, or if its friction is so sharp that simulations are slow, sets of effects are compared
-      along the recorded motion, and the loop is simulated at the end; a note says so.
+      law, if its friction is so sharp that simulations are slow, or if all drives act late as under
+      a law that is sampled, sets of effects are compared along the recorded motion, and the loop is
+      simulated at the end; a note says so.
     - `recordings`: recordings to fit. All recordings have one sample rate.
     - `validate`: held-out recordings. They do not enter the score; they test the final model. If
       None, the model is tested on the fitted recordings only.
@@ -148,9 +149,11 @@ def _with_and_without_standstill(
     say("the same without standstill, which the model describes worst")
     # Along the recorded motion, if the first search went on there.
     moving = dataclasses.replace(search.given, standstill=slower)
-    search = Search(asked, campaign, say, live_figure(progress), prefix="moving, ")
+    again = Search(asked, campaign, say, live_figure(progress), prefix="moving, ")
+    if search.why:
+        again.note(search.why)
     try:
-        story = _searched(search, moving, started)
+        story = _searched(again, moving, started)
     except KeyboardInterrupt:
         return dataclasses.replace(story, interrupted=True, reason=_STOPPED)
     notes = (*story.notes, *slow_note(loop.standstill, moving))

@@ -1,36 +1,98 @@
-"""Searches along the recorded motion although the law is known, because simulations are slow."""
+"""Searches along the recorded motion although a law is given."""
 
 import dataclasses
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..control import Tracking
+from ..effects import TimeDelay
 from ..errors import FitError, ModelError
+from ..estimate import Fit
 from ..recording import Recordings
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..simulation.steps import UNROLLED, needed_substeps
 from .comparison import compare
+from .explore import DECISIVE
+from .likelihood import noise_filters
+from .predict import Predictor
+from .system import System
+
+# Largest delay of a torque in samples that a sampled law explains.
+LATE = 2.0
+# Smallest significant delay, in standard deviations.
+_SURE = 3.0
+# Steps between two grid points up to which a simulation is fast enough.
+_STEPS = 16
 
 
 def along_recorded(loop: ClosedLoop) -> ClosedLoop:
     """The loop in which sets of effects are compared: along the recorded motion if fits are slow.
 
-    One fit of six joints in the simulated loop takes minutes, and a search needs dozens. So does a
-    fit of an arm that sticks: a sharp sign of velocity needs up to a hundred steps between two
-    samples or ticks. A sampled law is slow from the start; under a continuous law, the fit of the
-    starting model shows whether its loop needs that many. Below the bandwidth of the law, recorded
-    motion and torque have the same information. The loop is unchanged if positions are compared, or
-    if its effects have a motion of their own, which only a simulation gives.
+    One fit of six joints in the simulated loop takes minutes, and a search needs dozens. A sampled
+    law is slow, too. Below the bandwidth of the law, recorded motion and torque have the same
+    information. The loop is unchanged if positions are compared, or if its effects have a motion of
+    their own, which only a simulation gives.
     """
+    slow = loop.joints > UNROLLED or loop.controller.period is not None
+    return _without_law(loop) if slow else loop
+
+
+def along_after(first: Fit) -> tuple[ClosedLoop, str]:
+    """The loop in which the search continues after the fit of the starting model, and a note why.
+
+    Under a continuous law the fit shows whether simulations are slow: an arm that sticks needs up
+    to a hundred steps between two samples. It also shows whether the law is wrong.
+    """
+    loop = first.loop
+    along = _without_law(loop)
+    if along is loop or first.mistake:
+        return loop, ""
+    if (loop.stepping.substeps or 1) > _STEPS:
+        why = f"the starting model needs more than {_STEPS} steps between two samples"
+    elif late := sampled_law(first):
+        delays = ", ".join(f"{1e3 * x:.2g}" for x in late)
+        why = (
+            f"the torques seem to act {delays} ms late, like a law that is sampled and held, "
+            "although the law is declared as continuous: declare it by "
+            "jaxid.control.Sampled(law, every=...); until then"
+        )
+    else:
+        return loop, ""
+    return along, f"{why}, sets of effects are compared along the recorded motion, without the law"
+
+
+def _without_law(loop: ClosedLoop) -> ClosedLoop:
+    """The loop along its recorded motion; unchanged if that is not possible."""
     law = loop.controller
-    short = (loop.stepping.substeps or 1) > _STEPS
-    slow = loop.joints > UNROLLED or law.period is not None or short
-    if not slow or law.imposes or law.judged != "torque":
+    if law.imposes or law.judged != "torque":
         return loop
     along = dataclasses.replace(loop, controller=Tracking(delay=law.lag))
     return along if imposed(along) else loop
+
+
+def sampled_law(fit: Fit) -> tuple[float, ...]:
+    """Delays of the drives, s, if all are late as under a sampled law; empty if they are not.
+
+    The delays are estimated in the linear system of a fit under a continuous law. A single drive
+    that is late is an effect. With one joint the two are the same.
+    """
+    loop, period = fit.loop, fit.recordings.common_period()
+    if loop.joints < 2 or loop.controller.period is not None:
+        return ()
+    predictor = Predictor.of(System.of(fit), noise_filters(fit.residuals))
+    drives = [TimeDelay(joint=j + 1, delay=jnp.asarray(period / 2)) for j in range(loop.joints)]
+    nothing, late = predictor.predict(()), predictor.predict(drives)
+    rows = int(predictor.data.mask.sum()) * predictor.data.residual.shape[2]
+    gain = rows * np.log(nothing.loss / late.loss) - len(drives) * np.log(rows)
+    if not late.possible or gain < DECISIVE:
+        return ()
+    found = np.array([float(e.delay) for e in late.effects])
+    std = np.sqrt(np.diag(np.linalg.pinv(late.slopes.T @ late.slopes)) * late.loss / rows)
+    sure = np.all((found > _SURE * std) & (std > 0) & (found < LATE * period))
+    return tuple(found.tolist()) if sure else ()
 
 
 def in_the_loop(loop: ClosedLoop, models: Sequence[ClosedLoop], recordings: Recordings) -> str:
@@ -46,10 +108,10 @@ def in_the_loop(loop: ClosedLoop, models: Sequence[ClosedLoop], recordings: Reco
     elif loop.controller.period is not None:
         why = "the law is sampled"
     else:
-        why = f"the starting model needs more than {_STEPS} steps between two samples"
+        why = ""
+    so = "so sets of effects were compared along the recorded motion, without the law; "
     said = (
-        f"{why}, so sets of effects were compared along the recorded motion, without the law; in "
-        "the simulated loop the error of the torque on "
+        f"{why}, {so}" * bool(why) + "in the simulated loop the error of the torque on "
         f"{', '.join(recordings.names)}, mean over the joints, is"
     )
     try:
@@ -77,9 +139,9 @@ def _error(given: ClosedLoop, found: ClosedLoop, recordings: Recordings) -> floa
     return float(compare(loop, recordings).error_percent.to_numpy().mean())
 
 
-# Steps between two grid points up to which a simulation is fast enough, and shares of a joint's
-# highest speed to which the smoothing of its signs is raised for that.
-_STEPS, _SHARES = 16, np.geomspace(1e-6, 1e-1, 11)
+# Shares of a joint's highest speed to which the smoothing of its signs is raised, until a simulation
+# is fast enough.
+_SHARES = np.geomspace(1e-6, 1e-1, 11)
 
 
 def _softened(loop: ClosedLoop, recordings: Recordings) -> ClosedLoop:

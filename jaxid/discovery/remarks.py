@@ -11,6 +11,7 @@ from ..estimate.standstill import slow_note
 from ..simulation.batch import motion_cutoff
 from ..simulation.loop import ClosedLoop
 from ..simulation.widening import LEAD
+from .alongside import LATE
 from .hypotheses import effect_on
 from .models import named
 from .offsets import held_offsets
@@ -85,10 +86,6 @@ def _lead(value: float, fit: Fit) -> str:
     return _LOW_PASS.format(1e3 * constant) if value < constant else _SOFT
 
 
-# Largest delay of a torque in samples that a sampled law explains.
-_LATE = 2.0
-
-
 def _delayed(fit: Fit, given: ClosedLoop) -> list[str]:
     """A note on the delay between torque and motion, if the estimate contradicts the given one."""
     names = [p.name for p in fit.loop.free_parameters if p.place == ("controller", "delay")]
@@ -98,7 +95,7 @@ def _delayed(fit: Fit, given: ClosedLoop) -> list[str]:
         before = float(given.controller.late)
         if abs(value - before) > _APART * std:
             way = "later" if value > 0 else "earlier"
-            sampled = 0 < value <= _LATE * fit.recordings.common_period()
+            sampled = 0 < value <= LATE * fit.recordings.common_period()
             found.append(
                 f"the torque is estimated to act {1e3 * abs(value):.3g} ± {1e3 * std:.2g} ms {way} "
                 + ("than recorded" if before == 0 else f"than recorded, not {1e3 * before:.3g} ms")

@@ -13,7 +13,7 @@ from ..estimate import Fit
 from ..noise import ARFilter
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
-from .alongside import along_recorded
+from .alongside import along_after
 from .diagnosis import Diagnosis, over_recordings, share_left
 from .examined import Examined
 from .explore import DECISIVE, Candidate, explore, key_of, largest_first
@@ -49,6 +49,8 @@ class Search(Examined):
     **Arguments:** those of `Examined`.
     """
 
+    # Why the search went on along the recorded motion after the first fit; empty if it did not.
+    why: str = ""
     # Effects that were added and later removed.
     removed: tuple[Named, ...] = ()
     # Linear system and diagnosis of the current fit, until a prediction has used them.
@@ -102,9 +104,9 @@ class Search(Examined):
         """The starting model, fitted with noise filters."""
         self.watched.begin("fit", "fit of the starting model")
         first = self.fits.start(loop)
-        along = along_recorded(first.loop)
-        if along is not first.loop:
-            # The fit has shown that each simulation needs many steps.
+        along, self.why = along_after(first)
+        if self.why:
+            self.note(self.why)
             self.given = loop = dataclasses.replace(loop, controller=along.controller)
             first = self.fits.start(loop, "start along the recorded motion")
         screened, diagnosis = self._screened(first, ())
