@@ -244,6 +244,32 @@ def test_times_of_a_logger_are_told_and_evened(tmp_path):
     jaxid.Recording.from_arrays(time, np.sin(time), np.cos(3 * time))
 
 
+@pytest.mark.parametrize("late", [[-0.2, 0.2], [0.0, 0.6]])
+def test_missing_samples_leave_holes_in_even_times(tmp_path, late):
+    rng = np.random.default_rng(2)
+    gone = [100, 101, 350, *range(500, 504)]
+
+    def jitter(table):
+        table["stamp"] += 10 * rng.uniform(*late, len(table))
+        return table.drop(index=gone)
+
+    path = log(tmp_path / "run.csv", jitter)
+    names = {"time": "stamp", "q": ["pos1", "pos2"], "tau": ["cur1", "cur2"]}
+    given = {"columns": names, "units": {"time": "ms", "q": "deg"}, "clock": "even"}
+    with pytest.warns(
+        JaxidWarning, match="7 of 1001 samples seem to be missing, first after line 10"
+    ):
+        (even,) = jaxid.read(path, **given)
+    true = pd.read_csv(FIT_1).time.drop(index=gone)
+    np.testing.assert_allclose(np.diff(even.time), np.diff(true), atol=1e-5)
+    path = log(tmp_path / "long.csv", lambda table: jitter(table).drop(index=range(600, 660)))
+    with (
+        pytest.warns(JaxidWarning, match="67 of 1001"),
+        pytest.raises(RecordingError, match=r"has a gap of 0\.6"),
+    ):
+        jaxid.read(path, **given)
+
+
 def test_lines_are_counted_as_an_editor_does(tmp_path):
     path = tmp_path / "run.csv"
     lines = Path(FIT_1).read_text().splitlines()

@@ -125,6 +125,38 @@ def test_acceleration_that_is_not_asked_for_is_refused():
         jaxid.fit(loop, record)
 
 
+class Scalarly(AbstractEffect):
+    """A torque that is one number, which numpy would add to every joint."""
+
+    size: Scalar = parameter(0.0, symbol="size", unit="N·m")
+
+    def torque(self, motion):
+        return self.size * motion.q[0]
+
+
+class Foreign(AbstractEffect):
+    """A torque that calls numpy."""
+
+    size: Scalar = parameter(0.0, symbol="size", unit="N·m")
+
+    def torque(self, motion):
+        return self.size * np.sin(motion.q)
+
+
+@pytest.mark.parametrize(
+    ("effect", "says"),
+    [
+        (Scalarly(), r"scalarly has shape \(\), but the arm has 2 joints: .*on_joint"),
+        (Foreign(), "foreign passes a JAX array to numpy: use the functions of jax.numpy"),
+    ],
+)
+def test_torques_of_own_effects_are_one_array_per_joint(effect, says):
+    q = np.zeros((20, 2))
+    record = jaxid.Recording(np.arange(20) * 0.01, q, q, q_ref=q)
+    with pytest.raises(ModelError, match=says):
+        jaxid.fit(jaxid.scara().add(effect), record)
+
+
 def test_simulation_and_inverse_agree_on_the_load():
     """Beside a rotor, whose acceleration is solved for."""
     loop = jaxid.scara().add(

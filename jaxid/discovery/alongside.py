@@ -89,7 +89,7 @@ def sampled_law(fit: Fit) -> tuple[float, ...]:
     gain = rows * np.log(nothing.loss / late.loss) - len(drives) * np.log(rows)
     if not late.possible or gain < DECISIVE:
         return ()
-    found = np.array([float(e.delay) for e in late.effects])
+    found = np.array([float(e.delay) for e in late.effects if isinstance(e, TimeDelay)])
     std = np.sqrt(np.diag(np.linalg.pinv(late.slopes.T @ late.slopes)) * late.loss / rows)
     sure = np.all((found > _SURE * std) & (std > 0) & (found < LATE * period))
     return tuple(found.tolist()) if sure else ()
@@ -139,8 +139,8 @@ def _error(given: ClosedLoop, found: ClosedLoop, recordings: Recordings) -> floa
     return float(compare(loop, recordings).error_percent.to_numpy().mean())
 
 
-# Shares of a joint's highest speed to which the smoothing of its signs is raised, until a simulation
-# is fast enough.
+# Shares of a joint's highest speed to which the smoothing of its signs is raised, until simulations
+# are fast enough.
 _SHARES = np.geomspace(1e-6, 1e-1, 11)
 
 

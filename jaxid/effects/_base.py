@@ -217,18 +217,29 @@ class AbstractTransmission(AbstractEffect):
 
 
 def check_declared(effect: AbstractEffect, joints: int) -> None:
-    """Raises `ModelError` if a torque uses an acceleration that it does not get.
+    """Raises `ModelError` if the torque of an effect cannot be computed as the effect declares it.
 
     **Arguments:**
 
     - `effect`: any effect. `joints`: number of joints of its arm.
     """
-    if effect.inertial or effect.needs_acceleration:
-        return
     arrays, rest = eqx.partition(effect, eqx.is_array)
     shapes = jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), arrays)
     leaves, structure = jax.tree.flatten(shapes, is_leaf=lambda leaf: isinstance(leaf, tuple))
-    if _uses_acceleration(structure, tuple(leaves), rest, joints):
+    try:
+        shape, accelerated = _traced_torque(structure, tuple(leaves), rest, joints)
+    except jax.errors.TracerArrayConversionError as error:
+        raise ModelError(
+            f"{effect.effect_name()} passes a JAX array to numpy: use the functions of jax.numpy "
+            "in its torque"
+        ) from error
+    if shape != (joints,):
+        raise ModelError(
+            f"the torque of {effect.effect_name()} has shape {shape}, but the arm has {joints} "
+            f"joints: return one torque per joint, of shape ({joints},); "
+            "jaxid.effects.on_joint(joint, value, motion) makes it from one value"
+        )
+    if accelerated and not (effect.inertial or effect.needs_acceleration):
         raise ModelError(
             f"{effect.effect_name()} uses motion.a, which is zero for it: write `inertial = True` "
             "into its class if its torque is proportional to acceleration, or "
@@ -237,12 +248,15 @@ def check_declared(effect: AbstractEffect, joints: int) -> None:
 
 
 @lru_cache(maxsize=1024)
-def _uses_acceleration(
+def _traced_torque(
     structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...], rest: Any, joints: int
-) -> bool:
-    """Whether a torque depends on motion.a; traced once for each class of effect."""
+) -> tuple[tuple[int, ...], bool]:
+    """Shape of a torque, and whether it depends on motion.a; traced once for each class of effect.
 
-    def torque(leaves: list[Array], a: Float[Array, " joints"]) -> Float[Array, " joints"]:
+    Without the type checks of tests, a torque may have any shape.
+    """
+
+    def torque(leaves: list[Array], a: Float[Array, " joints"]) -> Float[Array, "..."]:
         effect = eqx.combine(jax.tree.unflatten(structure, leaves), rest)
         zeros, now = jnp.zeros(joints), jnp.zeros(())
         state = effect.initial_state()
@@ -252,7 +266,7 @@ def _uses_acceleration(
     leaves = [jax.ShapeDtypeStruct(shape, kind) for shape, kind in shapes]
     traced = jax.make_jaxpr(torque)(leaves, jax.ShapeDtypeStruct((joints,), float)).jaxpr
     _, used = dce_jaxpr(traced, [True] * len(traced.outvars))
-    return any(used[len(leaves) :])
+    return traced.outvars[0].aval.shape, any(used[len(leaves) :])
 
 
 def on_joint(joint: int, value: Float[Array, ""], motion: Motion) -> Float[Array, " joints"]:

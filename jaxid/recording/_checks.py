@@ -168,7 +168,7 @@ def validate(
         _finite(source, signal, checked[signal], labels, lines)
         _bounded(source, signal, checked[signal], labels, lines)
     if accept.clock == "even":
-        checked["time"] = even(source, checked["time"])
+        checked["time"] = even(source, checked["time"], lines)
     increasing(source, checked["time"], labels, accept.gaps, lines)
     steady(source, checked)
     for signal in ("q", "tau"):

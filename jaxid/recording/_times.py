@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int
 
 from ..errors import JaxidWarning
 from ._problem import Labels, Lines, label, place, problem
@@ -15,18 +15,61 @@ Gaps = Literal["refuse", "allow"]
 # A warning needs at least this jitter of times, in steps, and a motion that is smoother on even
 # times by at least this factor.
 _JITTER, _ROUGHER = 0.05, 2.0
+# Number of samples before and after a long step that show whether samples are missing there, share
+# of the spans of as many samples from which the first estimate of the period is taken, and number
+# of estimates.
+_NEAR, _SHORT, _TURNS = 10, 0.3, 3
+# Added to a delay in samples before it is rounded down. Less than a half, because a sample that is
+# wrongly taken for missing makes all later times wrong.
+_CERTAIN = 0.3
 
 
-def even(source: str, time: Float64[np.ndarray, " samples"]) -> Float64[np.ndarray, " samples"]:
-    """Evenly spaced times, by a straight line through the recorded ones.
+def even(
+    source: str, time: Float64[np.ndarray, " samples"], lines: Lines
+) -> Float64[np.ndarray, " samples"]:
+    """Times on the grid of the sampling, without jitter.
+
+    Missing samples leave holes in it, and a warning counts them.
 
     **Raises:** `RecordingError` for times that do not increase.
     """
-    number = np.arange(len(time))
-    slope, first = np.polyfit(number, time, 1)
-    if not slope > 0:
+    count = len(time)
+    near = min(_NEAR, count // 2)
+    # Few of the shortest spans lack a sample, and the jitter of a span is divided by its length.
+    period = float(np.quantile(time[near:] - time[:-near], _SHORT)) / near
+    first, number = 0.0, np.arange(count)
+    for _ in range(_TURNS if period > 0 else 0):
+        number = _numbered(time, period)
+        period, first = np.polyfit(number, time, 1)
+    if not period > 0:
         raise problem(source, "time does not increase over the recording", "give it in seconds")
-    return first + slope * number
+    missing = int(number[-1]) - count + 1
+    if missing:
+        first_hole = place(int(np.argmax(np.diff(number) > 1)), lines)
+        warnings.warn(
+            f"{source}: {missing} of {number[-1] + 1} samples seem to be missing, first after "
+            f"{first_hole}; the other times are evenly spaced around these holes.",
+            JaxidWarning,
+            stacklevel=5,
+        )
+    return first + period * number
+
+
+def _numbered(time: Float64[np.ndarray, " samples"], period: float) -> Int[np.ndarray, " samples"]:
+    """The number of each sample on a grid of this period.
+
+    A late sample is followed by shorter steps. After a missing one all samples are late, so the
+    earliest of the next samples is compared with the earliest of the last ones.
+    """
+    number = np.arange(len(time))
+    late = time - period * number
+    for k in np.flatnonzero(np.diff(time) > 1.5 * period):
+        before, after = late[max(k + 1 - _NEAR, 0) : k + 1], late[k + 1 : k + 1 + _NEAR]
+        missing = int((after.min() - before.min()) / period + _CERTAIN)
+        if missing > 0:
+            number[k + 1 :] += missing
+            late[k + 1 :] -= missing * period
+    return number
 
 
 def steady(source: str, signals: Mapping[str, Float64[np.ndarray, "..."]]) -> None:
