@@ -46,6 +46,7 @@ OFFSET = fx.TorqueOffset(joint=1, torque=0.1)
     ("substeps", "law", "why"),
     [
         (17, sim.PD(), "needs more than 16 steps"),
+        (None, sim.PD(Kv=(2.0, 10.0)), "check the law, its gains"),
         (None, sim.SampledPD(period=0.01), "like a law that is sampled"),
     ],
 )

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from functools import cache
 
+import equinox as eqx
 import independent as sim
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ import pytest
 import scipy
 
 import jaxid
-from jaxid.control import PD, Cascade, OpenLoop, Sampled, Tracking
+from jaxid.control import PD, AbstractController, Cascade, OpenLoop, Sampled, Tracking
 from jaxid.effects import Motion
 from jaxid.errors import ModelError, RecordingError
 from jaxid.simulation.loads import inverse
@@ -364,3 +365,29 @@ def test_laws_of_other_joints_are_refused():
     for noise in ([], [np.zeros((300, 2))]):
         with pytest.raises(RecordingError, match="noise"):
             jaxid.simulate(jaxid.scara(), recording, noise=noise)
+
+
+class Counting(AbstractController):
+    """A law with a state that nothing changes."""
+
+    every: float | None = eqx.field(static=True, default=None)
+
+    @property
+    def period(self):
+        return self.every
+
+    def initial_state(self, reading):
+        return jnp.zeros(2)
+
+    def command(self, reading, reference, state, mass):
+        return reference.q - reading.q + state
+
+
+@pytest.mark.parametrize(("every", "method"), [(None, "derivative"), (0.002, "tick")])
+def test_laws_whose_states_never_change_are_refused(every, method):
+    time = np.linspace(0, 3, 301)
+    q = np.stack([np.sin(2 * time), np.cos(3 * time)], axis=1)
+    recording = jaxid.Recording.from_arrays(time, q, q, q_ref=q)
+    loop = dataclasses.replace(jaxid.scara(), controller=Counting(every))
+    with pytest.raises(ModelError, match=f"has 2 states and .*: write `{method}`"):
+        jaxid.simulate(loop, recording)

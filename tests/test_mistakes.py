@@ -4,9 +4,11 @@ import dataclasses
 import re
 from pathlib import Path
 
+import independent as sim
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stories import recordings_of
 
 import jaxid
 from jaxid.effects import AbstractEffect, Motion
@@ -98,6 +100,22 @@ def test_a_missing_spring_is_not_named_as_a_wrong_sign(clean):
         time = motion.time[part]
         sprung.append(jaxid.Recording.from_arrays(time, q[part], tau[part], name=name))
     assert likely_mistake(jaxid.scara(), jaxid.Recordings.of(sprung)) == ""
+
+
+@pytest.mark.parametrize(
+    ("case", "blamed"),
+    [
+        ({"controller": sim.PD(Kp=(3.0, 156.25))}, True),
+        ({"effects": ["gravity"], "multiple": 20.0}, False),
+        ({"effects": ["joint_elasticity"], "multiple": 20.0}, False),
+    ],
+)
+def test_the_law_is_doubtful_only_if_the_arm_is_described_without_it(case, blamed):
+    recordings, _ = recordings_of(sim.make_case(5, duration=8.0, **case))
+    fit = jaxid.fit(jaxid.scara(), recordings)
+    assert fit.error_percent.to_numpy().max() > 20
+    assert any("without the law" in note for note in fit.notes) == blamed
+    assert fit.mistake == ""
 
 
 def test_a_torque_that_is_often_at_its_largest_value_is_named(clean):

@@ -72,8 +72,8 @@ def discover(
     **Arguments:**
 
     - `loop`: the starting model. With more than three joints under a known law, with a sampled
-      law, if its friction is so sharp that simulations are slow, or if all drives act late as under
-      a law that is sampled, sets of effects are compared along the recorded motion, and the loop is
+      law, if its friction is so sharp that simulations are slow, or if the first fit refutes the
+      law, sets of effects are compared along the recorded motion, and the loop is
       simulated at the end; a note says so.
     - `recordings`: recordings to fit. All recordings have one sample rate.
     - `validate`: held-out recordings. They do not enter the score; they test the final model. If

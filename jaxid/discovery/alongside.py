@@ -10,6 +10,7 @@ from ..control import Tracking
 from ..effects import TimeDelay
 from ..errors import FitError, ModelError
 from ..estimate import Fit
+from ..estimate.mistakes import doubtful_law
 from ..recording import Recordings
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
@@ -52,6 +53,8 @@ def along_after(first: Fit) -> tuple[ClosedLoop, str]:
         return loop, ""
     if (loop.stepping.substeps or 1) > _STEPS:
         why = f"the starting model needs more than {_STEPS} steps between two samples"
+    elif wrong := doubtful_law(first):
+        why = f"{wrong}; until then"
     elif late := sampled_law(first):
         delays = ", ".join(f"{1e3 * x:.2g}" for x in late)
         why = (

@@ -15,11 +15,12 @@ from ..control import Reading, Sampled
 from ..effects import AbstractEffect, AbstractTransmission, check_declared
 from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
-from ..simulation.batch import at_rest, check_joints, check_law, motion_cutoff
+from ..simulation.batch import at_rest, motion_cutoff
+from ..simulation.checks import check_joints, check_law
 from ..simulation.loop import ClosedLoop
 from ..simulation.sharing import with_one_blas_thread
 from .drawn import contradiction
-from .mistakes import LARGE_PERCENT, at_limit, likely_mistake
+from .mistakes import LARGE_PERCENT, at_limit, doubtful_law, likely_mistake
 from .oem import OEM, oem_of
 from .prior import drawing_note
 from .result import DOUBTFUL_PERCENT, AbstractMethod, Fit, Status
@@ -176,7 +177,7 @@ def _without_nan(found: Fit) -> Fit:
 
 
 def _examined(found: Fit, loop: ClosedLoop) -> Fit:
-    """The fit with the likely mistake in its recordings, if there is one.
+    """The fit with the likely mistake in its recordings, or a note on its law, if there is one.
 
     A fit from given values continues another fit of the same recordings, which was examined.
 
@@ -189,7 +190,8 @@ def _examined(found: Fit, loop: ClosedLoop) -> Fit:
     largest = float((found.error_percent * _of_motion(found)).to_numpy().max())
     mistake = "" if largest < LARGE_PERCENT else likely_mistake(loop, found.recordings)
     mistake = mistake or _unrelated(found) or _limited(found) or contradiction(found)
-    notes = (mistake, *found.notes) if mistake else found.notes
+    said = mistake or (doubtful_law(found) if largest >= LARGE_PERCENT else "")
+    notes = (said, *found.notes) if said else found.notes
     return dataclasses.replace(found, mistake=mistake, notes=notes)
 
 

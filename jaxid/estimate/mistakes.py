@@ -15,12 +15,15 @@ from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from .idim import stack_with_motion
 from .regression import linear_parameters
+from .result import Fit
 
 # Relative error, %, above which a mistake is looked for.
 LARGE_PERCENT = 10.0
 # A mistake is named if its correction reduces the squared error to less than this share, and the
 # relative error to less than this, %.
 _SHARE, _GOOD = 0.25, 20.0
+# Ratio of the errors with and without a law above which the law is doubtful.
+_BETTER = 3.0
 # Share of samples at the largest torque above which a drive may be at its limit.
 _OFTEN = 0.05
 # Weight of the coefficients of columns of unit length in the regressions.
@@ -73,6 +76,38 @@ def likely_mistake(loop: ClosedLoop, recordings: Recordings) -> str:
     )
 
 
+def doubtful_law(found: Fit) -> str:
+    """A sentence if a regression without the law explains much more than the simulated loop.
+
+    What a model lacks is missing in both. Both errors are those of the low-passed torque.
+    """
+    law, recordings = found.loop.controller, found.recordings
+    if law.imposes or law.judged != "torque" or not found.status.simulated:
+        return ""
+    rest = [dataclasses.replace(r, tau=x) for r, x in zip(recordings, found.residuals, strict=True)]
+    try:
+        left, torque = (
+            stack_with_motion(found.loop, rows)[1]["tau"]
+            for rows in (Recordings.of(rest), recordings)
+        )
+    except JaxidError:
+        return ""
+    without = _left(found.loop, recordings, position=False)
+    if without is None:
+        return ""
+    size = np.maximum(np.linalg.norm(torque, axis=0), 1e-300)
+    percent = 100 * np.linalg.norm(left, axis=0) / size
+    j = int(np.argmax(percent - without))
+    if percent[j] < LARGE_PERCENT or percent[j] < _BETTER * without[j]:
+        return ""
+    return (
+        f"the simulated loop leaves {percent[j]:.2g} % of the torque of joint {j + 1}, and a "
+        f"regression along the recorded motion, without the law, {without[j]:.2g} %: check the "
+        "law, its gains, signs, time stamps and the reference, or use Tracking() (--controller "
+        "tracking)"
+    )
+
+
 def at_limit(recordings: Recordings, joints: Sequence[int] | None = None) -> str:
     """The joints whose torque often has one largest value, as a sentence; empty if there are none.
 
@@ -103,8 +138,15 @@ def _still(recordings: Recordings) -> Iterator[tuple[str, float]]:
         yield f"joint {j + 1}", float(span[j])
 
 
-def _left(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " joints"] | None:
-    """Relative error of each joint's torque in a bounded regression, %; None if it fails."""
+def _left(
+    loop: ClosedLoop, recordings: Recordings, position: bool = True
+) -> Float[np.ndarray, " joints"] | None:
+    """Relative error of each joint's torque in a bounded regression, %; None if it fails.
+
+    **Arguments:**
+
+    - `position`: whether joints have an additional torque by position.
+    """
     import scipy
 
     try:
@@ -112,7 +154,8 @@ def _left(loop: ClosedLoop, recordings: Recordings) -> Float[np.ndarray, " joint
         chosen = linear_parameters(loop)
     except JaxidError:
         return None
-    wide = np.concatenate([stacked.columns, _of_position(rows["q"])], axis=-1)
+    own = [_of_position(rows["q"])] if position else []
+    wide = np.concatenate([stacked.columns, *own], axis=-1)
     # Relative to the recorded torque; the right-hand side is without that of held bodies.
     size = np.maximum(np.linalg.norm(rows["tau"], axis=0), 1e-300)
     columns = (wide / size[:, None]).reshape(-1, wide.shape[-1])

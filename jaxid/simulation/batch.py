@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..control import AbstractController, Reading, Reference
+from ..control import AbstractController
 from ..effects import recording_label
-from ..errors import JaxidError, ModelError, RecordingError
+from ..errors import RecordingError
 from ..recording import Recording, Recordings
 from ..signals.smoothing import Band, shared_length, signal_cutoff
+from .checks import check_joints
 from .compared import compared_part
 from .loop import ClosedLoop
 
@@ -214,39 +215,6 @@ def at_rest(recording: Recording) -> bool:
         recording.time[step:] - recording.time[:-step]
     )[:, None]
     return bool(np.all(np.abs(start) < 1e-2 * np.abs(speed).max(axis=0)))
-
-
-def check_joints(loop: ClosedLoop, recording: Recording) -> None:
-    """Raises `RecordingError` if a recording's number of joints differs from the loop's."""
-    if recording.joints != loop.joints:
-        raise RecordingError(
-            f"{recording.name} has {recording.joints} joints, but the robot {loop.name} has "
-            f"{loop.joints}: choose another robot, or name the columns of its joints"
-        )
-
-
-def check_law(loop: ClosedLoop) -> None:
-    """Raises `ModelError` if a controller's gains do not match the number of joints of the arm."""
-    n = loop.joints
-
-    def command(zeros):
-        reading = Reading(zeros, zeros)
-        reference = Reference(zeros, zeros, zeros, zeros)
-        law = loop.controller
-        return law.command(reading, reference, law.initial_state(reading), jnp.outer(zeros, zeros))
-
-    who = f"{type(loop.controller).__name__} of {loop.name}"
-    try:
-        shape = jax.eval_shape(command, jnp.zeros(n)).shape
-    except JaxidError:
-        raise
-    except (TypeError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise ModelError(
-            f"{who} gives no torque for {n} joints, set all gains: {reason}"
-        ) from error
-    if shape != (n,):
-        raise ModelError(f"{who} gives torques of shape {shape}, but there are {n} joints")
 
 
 def _check_noise(noise: Sequence[np.ndarray], recordings: Recordings | Sequence[Recording]) -> None:

@@ -14,7 +14,8 @@ from jaxtyping import Array, Float, Int
 from ..compiling import compiled
 from ..recording import Recording, Recordings
 from ..signals.standstill import Standstill
-from .batch import Batch, Interval, check_law, prepare
+from .batch import Batch, Interval, prepare
+from .checks import check_law
 from .dynamics import imposed
 from .integration import (
     initial,

@@ -16,7 +16,8 @@ from ..control import Reading, Reference
 from ..effects import NOBODY, Coulomb
 from ..errors import JaxidWarning, ModelError
 from ..recording import Recordings
-from .batch import check_joints, held_at, held_names
+from .batch import held_at, held_names
+from .checks import check_joints
 from .dynamics import Outside, imposed, instant
 from .loop import ClosedLoop
 from .state import rest, unflatten
