@@ -1,7 +1,9 @@
 """Notes on values that a fit along the recorded motion estimated."""
 
 import dataclasses
+import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_release import arctan, axis, recorded
@@ -9,6 +11,7 @@ from test_release import arctan, axis, recorded
 import jaxid
 from jaxid.discovery.remarks import remarks
 from jaxid.discovery.step import Step
+from jaxid.effects import Stribeck
 
 
 @pytest.fixture(scope="module")
@@ -55,3 +58,19 @@ def test_a_lead_below_the_time_constant_of_the_low_pass_is_its_work(fitted):
     told = notes(fitted, lead1=0.0095)
     assert "soft constraints" in told
     assert "at this cutoff" not in told
+
+
+def test_an_effect_with_uncertain_values_is_told_with_what_can_replace_it(fitted):
+    loop = fitted.loop.add(Stribeck(joint=1, level=jnp.asarray(1.0), velocity=jnp.asarray(0.1)))
+
+    def told(deviation):
+        covariance = deviation**2 * np.eye(len(loop.names))
+        fit = dataclasses.replace(fitted, loop=loop, covariance=covariance)
+        steps = [
+            Step("start", fit, None, None),
+            Step("+", fit, None, None, added=loop.effects[-1]),
+        ]
+        return " | ".join(remarks(steps, axis(), {}))
+
+    assert re.search(r"each value of stribeck on joint 1 is uncertain.*lead1.*the sum", told(2.0))
+    assert "is uncertain" not in told(0.04)

@@ -15,7 +15,8 @@ from .alongside import LATE
 from .hypotheses import effect_on
 from .models import named
 from .offsets import held_offsets
-from .step import Step
+from .step import Step, found_parameters
+from .text import joined
 
 
 def remarks(
@@ -32,8 +33,34 @@ def remarks(
     said = [f"the fit of {', '.join(bad)} did not converge: use its values with care"]
     last = steps[-1].fit
     more = (*_estimated(last, given), *_delayed(last, given), *_instead(last, given, offsets))
+    more = (*more, *_uncertain(steps))
     more = (*more, *slow_note(given.standstill, last.loop), *looks_sampled(last))
     return (*(said if bad else ()), *more)
+
+
+# Deviations of its value up to which it is not determined on its own.
+_VAGUE = 2.0
+
+
+def _uncertain(steps: Sequence[Step]) -> list[str]:
+    """Notes on added effects that are certain although each of their values is uncertain."""
+    loop = steps[-1].fit.loop
+    shapes = [p for p in loop.free_parameters if p.place[0] == "effects" and p.size == 1]
+    found = []
+    added = [step.added for step in steps if step.added is not None]
+    for k, effect in enumerate(added):
+        values = found_parameters(steps, k).values()
+        if any(x["std"] is not None and abs(x["value"]) > _VAGUE * x["std"] for x in values):
+            continue
+        joint = getattr(effect, "joint", None)
+        free = [p.name for p in shapes if p.joint == joint and not p.declaration.linear]
+        if joint is not None and free:
+            found.append(
+                f"each value of {effect_on(*named(effect))} is uncertain, although the error is "
+                f"larger without it: its size and {joined(free)} can replace each other, and the "
+                f"recordings determine only the sum of the effects on joint {joint}"
+            )
+    return found
 
 
 # What the lead of a friction means: a small one, and one above the time constant of the low-pass.
