@@ -52,19 +52,19 @@ def along_after(first: Fit) -> tuple[ClosedLoop, str]:
     if along is loop or first.mistake:
         return loop, ""
     if (loop.stepping.substeps or 1) > _STEPS:
-        why = f"the starting model needs more than {_STEPS} steps between two samples"
+        why = f"the starting model needs more than {_STEPS} steps between two samples, so"
     elif wrong := doubtful_law(first):
-        why = f"{wrong}; until then"
+        why = f"{wrong}; until then,"
     elif late := sampled_law(first):
         delays = ", ".join(f"{1e3 * x:.2g}" for x in late)
         why = (
             f"the torques seem to act {delays} ms late, like a law that is sampled and held, "
             "although the law is declared as continuous: declare it by "
-            "jaxid.control.Sampled(law, every=...); until then"
+            "jaxid.control.Sampled(law, every=...); until then,"
         )
     else:
         return loop, ""
-    return along, f"{why}, sets of effects are compared along the recorded motion, without the law"
+    return along, f"{why} sets of effects are compared along the recorded motion, without the law"
 
 
 def _without_law(loop: ClosedLoop) -> ClosedLoop:
@@ -106,17 +106,15 @@ def in_the_loop(loop: ClosedLoop, models: Sequence[ClosedLoop], recordings: Reco
     - `loop`: the given loop, with its law. `models`: loops along the recorded motion, the starting
       model first. `recordings`: held-out recordings, if there are any.
     """
-    if loop.joints > UNROLLED:
-        why = f"{loop.name} has {loop.joints} joints"
-    elif loop.controller.period is not None:
-        why = "the law is sampled"
-    else:
-        why = ""
-    so = "so sets of effects were compared along the recorded motion, without the law; "
-    said = (
-        f"{why}, {so}" * bool(why) + "in the simulated loop the error of the torque on "
-        f"{', '.join(recordings.names)}, mean over the joints, is"
-    )
+    where = ", ".join(recordings.names)
+    said = f"in the simulated loop the error of the torque on {where}, mean over the joints, is"
+    if along_recorded(loop) is not loop:
+        many = loop.joints > UNROLLED
+        why = f"{loop.name} has {loop.joints} joints" if many else "the law is sampled"
+        said = (
+            f"{why}, so sets of effects were compared along the recorded motion, without the law; "
+            f"{said}"
+        )
     try:
         last = _error(loop, models[-1], recordings)
         before = ""

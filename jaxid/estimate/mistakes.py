@@ -84,12 +84,10 @@ def doubtful_law(found: Fit) -> str:
     law, recordings = found.loop.controller, found.recordings
     if law.imposes or law.judged != "torque" or not found.status.simulated:
         return ""
-    rest = [dataclasses.replace(r, tau=x) for r, x in zip(recordings, found.residuals, strict=True)]
+    pairs = zip(recordings, found.residuals, strict=True)
     try:
-        left, torque = (
-            stack_with_motion(found.loop, rows)[1]["tau"]
-            for rows in (Recordings.of(rest), recordings)
-        )
+        rest = Recordings.of([dataclasses.replace(r, tau=x) for r, x in pairs])
+        left, torque = (stack_with_motion(found.loop, r)[1]["tau"] for r in (rest, recordings))
     except JaxidError:
         return ""
     without = _left(found.loop, recordings, position=False)
