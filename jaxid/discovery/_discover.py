@@ -141,7 +141,8 @@ def _with_and_without_standstill(
     """The result of a search, repeated without standstill if the model describes that worst."""
     search = Search(asked, campaign, say, live_figure(progress))
     story = _searched(search, loop, started)
-    if story.verdict != "undetermined" or story.interrupted or story.fit.mistake:
+    done = story.verdict != "undetermined" or story.interrupted
+    if done or story.fit.mistake or search.refuted:
         return story
     slower = worst_at_standstill(story.fit)
     if slower is None:
@@ -184,6 +185,7 @@ def _told(
         reason = _doubt(search, verdict, steps)
         if unfinished and steps[-1].fit.status is Status.converged:
             reason = short
+    reason = reason or search.refuted
     if (reason and not interrupted) or verdict == "outside_catalogue":
         # Probabilities assume that one of the examined models is right.
         steps = [s if s.added is None else dataclasses.replace(s, probability=None) for s in steps]

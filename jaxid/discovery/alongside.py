@@ -9,8 +9,7 @@ import numpy as np
 from ..control import Tracking
 from ..effects import TimeDelay
 from ..errors import FitError, ModelError
-from ..estimate import Fit
-from ..estimate.mistakes import doubtful_law
+from ..estimate import Fit, Status
 from ..recording import Recordings
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
@@ -41,20 +40,24 @@ def along_recorded(loop: ClosedLoop) -> ClosedLoop:
     return _without_law(loop) if slow else loop
 
 
-def along_after(first: Fit) -> tuple[ClosedLoop, str]:
+def along_after(first: Fit, wrong: str) -> tuple[ClosedLoop, str]:
     """The loop in which the search continues after the fit of the starting model, and a note why.
 
     Under a continuous law the fit shows whether simulations are slow: an arm that sticks needs up
-    to a hundred steps between two samples. It also shows whether the law is wrong.
+    to a hundred steps between two samples. It also shows whether the law is sampled.
+
+    **Arguments:**
+
+    - `wrong`: why the law is doubtful; empty if it is not.
     """
     loop = first.loop
     along = _without_law(loop)
-    if along is loop or first.mistake:
+    if along is loop or first.mistake or first.status is Status.misfit:
         return loop, ""
     if (loop.stepping.substeps or 1) > _STEPS:
         why = f"the starting model needs more than {_STEPS} steps between two samples, so"
-    elif wrong := doubtful_law(first):
-        why = f"{wrong}; until then,"
+    elif wrong:
+        why = "the law is doubtful, so"
     elif late := sampled_law(first):
         delays = ", ".join(f"{1e3 * x:.2g}" for x in late)
         why = (

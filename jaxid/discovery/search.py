@@ -10,6 +10,7 @@ import numpy as np
 from ..effects import AbstractEffect
 from ..errors import FitError, ModelError
 from ..estimate import Fit
+from ..estimate.mistakes import doubtful_law
 from ..noise import ARFilter
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
@@ -49,6 +50,8 @@ class Search(Examined):
     **Arguments:** those of `Examined`.
     """
 
+    # Why the law is doubtful; empty if it is not.
+    refuted: str = ""
     # Why the search went on along the recorded motion after the first fit; empty if it did not.
     why: str = ""
     # Effects that were added and later removed.
@@ -104,7 +107,8 @@ class Search(Examined):
         """The starting model, fitted with noise filters."""
         self.watched.begin("fit", "fit of the starting model")
         first = self.fits.start(loop)
-        along, self.why = along_after(first)
+        self.refuted = doubtful_law(first)
+        along, self.why = along_after(first, self.refuted)
         if self.why:
             self.note(self.why)
             self.given = loop = dataclasses.replace(loop, controller=along.controller)

@@ -84,6 +84,9 @@ def doubtful_law(found: Fit) -> str:
     law, recordings = found.loop.controller, found.recordings
     if law.imposes or law.judged != "torque" or not found.status.simulated:
         return ""
+    if [len(x) for x in found.residuals] != [len(r.tau) for r in recordings]:
+        # A regression does not simulate the loop.
+        return ""
     pairs = zip(recordings, found.residuals, strict=True)
     try:
         rest = Recordings.of([dataclasses.replace(r, tau=x) for r, x in pairs])
