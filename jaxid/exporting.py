@@ -1,6 +1,7 @@
 """Export of fitted arms: URDF has kinematics and bodies, MJCF also has drives."""
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -10,9 +11,12 @@ from jaxtyping import Float
 
 from .arms import SerialArm
 from .arms.urdf import parsed_urdf, read_urdf
-from .errors import ModelError
+from .chain import moved_body
+from .effects import AbstractEffect, CarriedBody, Coulomb, Viscous
+from .errors import JaxidWarning, ModelError
+from .parameters import list_parameters, read_values
 from .simulation.loop import ClosedLoop
-from .simulation.terms import JointTerms, joint_terms
+from .simulation.terms import SAID, JointTerms, joint_terms
 
 
 def write_urdf(
@@ -26,9 +30,10 @@ def write_urdf(
 ) -> Path:
     """Writes a copy of a URDF with identified bodies and friction; the rest is unchanged.
 
-    Each joint's link gets the inertia of everything that moves with it; links fixed to it get none.
-    `<dynamics>` gets viscous and Coulomb friction. A URDF cannot describe rotors; `write_mjcf`
-    does.
+    Each joint's link gets the inertia of everything that moves with it, the last one also that of a
+    payload on all recordings; links fixed to it get none. `<dynamics>` gets viscous and Coulomb
+    friction. A warning names the effects that are left out, such as rotors, which `write_mjcf`
+    writes, and links whose bodies are not physical.
 
     **Arguments:**
 
@@ -46,7 +51,16 @@ def write_urdf(
             f"this URDF has {len(found.joints)} joints, but {loop.name} has {arm.joints}: give the "
             "URDF that the arm was read from"
         )
-    masses = np.asarray(arm.inertias() if bodies is None else bodies)
+    masses = _with_payload(loop, arm.inertias() if bodies is None else bodies)
+    _warn_of_the_rest(loop, path, (Viscous, Coulomb))
+    wrong = [k for k, body in enumerate(masses, start=1) if not _is_physical(body)]
+    if wrong:
+        warnings.warn(
+            f"the identified bodies of link{'s' * (len(wrong) > 1)} {', '.join(map(str, wrong))} "
+            f"are not physical, and simulators may refuse {path}: {_NEAREST}",
+            JaxidWarning,
+            stacklevel=2,
+        )
     root = parsed_urdf(source)
     links = {link.get("name"): link for link in root.findall("link")}
     for name in found.carried:
@@ -75,8 +89,9 @@ def write_mjcf(
 ) -> Path:
     """Writes a MuJoCo model of the arm: bodies, rotors (armature), viscous and dry friction.
 
-    If the law has constant gains on position and velocity, joints get position actuators as well;
-    `simulator_terms` lists the properties of the drives that are left out.
+    The last link has a payload on all recordings as well. If the law has constant gains on position
+    and velocity, joints get position actuators; `simulator_terms` lists the properties of the
+    drives that are left out. A warning names the effects that are left out.
 
     **Arguments:**
 
@@ -88,7 +103,8 @@ def write_mjcf(
     from scipy.spatial.transform import Rotation
 
     arm = _serial(loop)
-    masses = np.asarray(arm.inertias() if bodies is None else bodies)
+    masses = _with_payload(loop, arm.inertias() if bodies is None else bodies)
+    _warn_of_the_rest(loop, path, SAID)
     chain = arm.chain
     root = ElementTree.Element("mujoco", model=loop.name)
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true")
@@ -103,10 +119,10 @@ def write_mjcf(
         )
         mass, centre, about = _about_centre(masses[k])
         xx, xy, xz, yy, yz, zz = about[np.triu_indices(3)]
-        if mass <= 0 or np.linalg.eigvalsh(about)[0] <= 0:
+        if not _is_physical(masses[k]):
             raise ModelError(
-                f"link {k + 1} has mass {mass:.3g} kg and an inertia that is not physical: give "
-                "bodies=jaxid.arms.physical_bodies(arm).bodies"
+                f"link {k + 1} has mass {mass:.3g} kg and an inertia that is not physical: "
+                f"{_NEAREST}"
             )
         ElementTree.SubElement(
             parent,
@@ -130,6 +146,54 @@ def write_mjcf(
     ElementTree.indent(root)
     Path(path).write_text(ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
     return Path(path)
+
+
+_NEAREST = "give bodies=jaxid.arms.physical_bodies(arm, covariance).bodies"
+# Relative error of an inertia by rounding.
+_ROUNDED = 1e-9
+
+
+def _is_physical(body: Float[np.ndarray, "10"]) -> bool:
+    """Whether a simulator accepts a body: positive, no principal inertia above the other two."""
+    mass, _, about = _about_centre(body)
+    small, middle, large = np.linalg.eigvalsh(about)
+    return bool(mass > 0 and small > 0 and small + middle >= large * (1 - _ROUNDED))
+
+
+def _with_payload(loop: ClosedLoop, bodies: Any) -> Float[np.ndarray, "joints 10"]:
+    """The bodies, the last one with what it carries on all recordings."""
+    found = np.array(bodies)
+    for effect in loop.effects:
+        if isinstance(effect, CarriedBody) and not effect.recordings:
+            found[-1] += np.asarray(moved_body(effect.about_tip(), effect.chain.tip))
+    return found
+
+
+def _warn_of_the_rest(
+    loop: ClosedLoop, path: str | os.PathLike[str], written: tuple[type[AbstractEffect], ...]
+) -> None:
+    """Warns of effects that a file does not describe.
+
+    **Arguments:**
+
+    - `written`: classes of effects that it describes, beside a payload.
+    """
+    joints: dict[str, list[str]] = {}
+    for effect in loop.effects:
+        carried = isinstance(effect, CarriedBody) and not effect.recordings
+        sizes = [p for p in list_parameters(effect) if p.declaration.linear]
+        absent = bool(sizes) and not np.any(read_values(effect, sizes))
+        if not (carried or absent or isinstance(effect, written)):
+            own = joints.setdefault(effect.effect_name(), [])
+            own += [str(effect.joint)] if hasattr(effect, "joint") else []
+    left = [f"{name} on joint {', '.join(own)}" if own else name for name, own in joints.items()]
+    if left:
+        warnings.warn(
+            f"{path} has no {'; '.join(left)}: this format cannot describe them, so what reads the "
+            "file has less than the fitted model",
+            JaxidWarning,
+            stacklevel=3,
+        )
 
 
 def _serial(loop: ClosedLoop) -> SerialArm:

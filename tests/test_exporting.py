@@ -10,7 +10,8 @@ import pytest
 import jaxid
 from jaxid.arms import SerialArm, physical_bodies
 from jaxid.arms.physical import chance_of, smallest_eigenvalues
-from jaxid.errors import ModelError
+from jaxid.effects import CarriedBody, Motion, Stribeck
+from jaxid.errors import JaxidWarning, ModelError
 from tests.test_serial import POLAR, SHARED, pinocchio_of
 from tests.test_serial import described as described
 
@@ -140,6 +141,50 @@ def test_only_arms_in_space_are_written_and_only_to_their_own_urdf(described, tm
     negative = np.asarray(jaxid.serial(one).arm.bodies) * [*[1] * 9, -1]
     with pytest.raises(ModelError, match="physical_bodies"):
         jaxid.write_mjcf(jaxid.serial(one), tmp_path / "out.xml", bodies=negative)
+
+
+def test_a_payload_is_written_into_the_last_link_and_the_rest_is_told(described, tmp_path):
+    path, tip = described
+    loop, bodies = other(jaxid.serial(path, tip=tip))
+    bodies = physical_bodies(dataclasses.replace(loop.arm, bodies=bodies)).bodies
+    base = jnp.asarray(loop.arm.combined @ np.ravel(bodies))
+    loop = dataclasses.replace(loop, arm=dataclasses.replace(loop.arm, base=base))
+    held = CarriedBody(loop.arm.chain, 0.8, (0.02, 0.0, 0.0, 0.02, 0.0, 0.02, 0.04, -0.02, 0.05))
+    carrying = loop.add(held, Stribeck(joint=2, level=jnp.asarray(0.4)))
+    with pytest.warns(JaxidWarning, match=r"has no rotor_inertia on joint 1.*stribeck on joint 2"):
+        out = jaxid.write_urdf(carrying, path, tmp_path / "out.urdf", bodies=bodies, tip=tip)
+    with pytest.warns(JaxidWarning, match="stribeck on joint 2") as told:
+        jaxid.write_mjcf(carrying, tmp_path / "out.xml", bodies=bodies)
+    assert not any("rotor_inertia" in str(x.message) for x in told)
+    again = jaxid.serial(out, tip=tip).arm
+    for q, v, a in states(loop.arm):
+        zero = jnp.zeros(())
+        motion = Motion(
+            zero,
+            *map(jnp.asarray, (q, v, a)),
+            jnp.zeros_like(v),
+            jnp.zeros(0),
+            jnp.asarray(0),
+            {},
+            jnp.zeros_like(v),
+        )
+        ours = torque(loop.arm, q, v, a) + np.asarray(held.torque(motion))
+        size = np.abs(ours).max()
+        np.testing.assert_allclose(torque(again, q, v, a), ours, rtol=1e-9, atol=1e-9 * size)
+
+
+def test_bodies_that_simulators_refuse_are_told(tmp_path):
+    path = tmp_path / "polar.urdf"
+    path.write_text(POLAR)
+    loop = jaxid.serial(path)
+    bodies = np.array(loop.arm.bodies)
+    # One principal inertia above the sum of the others.
+    bodies[1, :6] = 0.01, 0.0, 0.0, 0.01, 0.0, 0.05
+    bodies[1, 6:9] = 0.0
+    with pytest.warns(JaxidWarning, match="bodies of link 2 are not physical.*physical_bodies"):
+        jaxid.write_urdf(loop, path, tmp_path / "out.urdf", bodies=bodies)
+    with pytest.raises(ModelError, match="link 2 has mass .*physical_bodies"):
+        jaxid.write_mjcf(loop, tmp_path / "out.xml", bodies=bodies)
 
 
 @pytest.mark.slow
