@@ -18,6 +18,7 @@ from jaxid.discovery.offsets import held_offsets, instead_of_offsets
 from jaxid.discovery.predict import Predictor
 from jaxid.discovery.search import Search
 from jaxid.discovery.system import System
+from jaxid.discovery.undecided import undecided
 from jaxid.discovery.verify import Refits
 from jaxid.effects import AsymmetricFriction, QuadraticDrag
 from jaxid.noise import ARFilter
@@ -140,3 +141,22 @@ def test_where_noise_hides_the_difference_both_have_a_weight():
     # more weight.
     assert 0.5 < weights["asymmetric_friction on joint 1"] < 0.95
     assert weights.sum() == pytest.approx(1.0)
+
+
+def test_an_offset_and_its_friction_at_one_score_do_not_contradict_each_other():
+    fit = jaxid.fit(axis(EPS), [biased(1, False, 0.1)])
+    friction = AsymmetricFriction(joint=1)
+    loop = fit.loop.add(friction).hold(offset1=0.0)
+    there = dataclasses.replace(fit, loop=loop)
+    start = Model((), 100.0, fit=fit, weight=0.4)
+
+    def told(score, other=there):
+        rival = Model((friction,), score, fit=other, weight=0.6)
+        return undecided(sorted([rival, start], key=lambda m: m.score), start, {}, 0.05)
+
+    assert told(99.0) == ""
+    assert told(102.0) == ""
+    # Unless the friction is decidedly better, or in addition to the offset.
+    assert "asymmetric_friction on joint 1 has 0.6" in told(97.0)
+    beside = dataclasses.replace(fit, loop=fit.loop.add(friction))
+    assert "asymmetric_friction on joint 1 has 0.6" in told(99.0, beside)

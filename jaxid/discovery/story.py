@@ -30,6 +30,7 @@ from .landscape import form
 from .models import Model, models_table, named, picked
 from .step import Step, added_in_words, errors_of, found_parameters, joint_errors, odds, step_name
 from .text import WIDTH, capitalised, errors_table, in_brackets, joined, models_lines, wrapped
+from .undecided import probability_of_start
 from .verdict import Outcome
 from .verify import Refits
 
@@ -136,8 +137,8 @@ class Discovery(AbstractShown):
 
     def _sure(self) -> str:
         """The probability of the starting model, as part of a sentence."""
-        start = next((m for m in self.considered if not m.effects and m.curve is None), None)
-        return "" if start is None else f" (probability {odds(start.weight)})"
+        there = any(not m.effects and m.curve is None for m in self.considered)
+        return f" (probability {odds(probability_of_start(self.considered))})" if there else ""
 
     def table(self) -> "pd.DataFrame":
         """Error by step and joint, on fitted and held-out recordings, %."""

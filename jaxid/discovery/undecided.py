@@ -6,10 +6,13 @@ from collections.abc import Mapping, Sequence
 from .hypotheses import effect_on
 from .likelihood import weights
 from .models import LIKELY, Model, Named, probability
+from .offsets import held_offsets
 from .verdict import risen
 
 # Smallest probability of the starting model for the verdict `adequate`.
 _HALF = 0.5
+# A smaller difference of scores is not worth more than a bare mention (Kass and Raftery 1995).
+_BARE = 2.0
 
 
 def undecided(
@@ -30,11 +33,12 @@ def undecided(
     """
     start = next(m for m in models if not m.effects and m.curve is None)
     if not chosen.effects:
-        if start.weight >= _HALF:
+        share = probability_of_start(models)
+        if share >= _HALF:
             return ""
         rival = next(m for m in models if m is not start)
         return (
-            f"the starting model has a probability of only {start.weight:.2g}, and "
+            f"the starting model has a probability of only {share:.2g}, and "
             f"{rival.label} has {rival.weight:.2g}: record more, or longer"
         )
     if chosen.score < start.score - LIKELY:
@@ -43,6 +47,25 @@ def undecided(
         f"the score of the starting model is only {start.score - chosen.score:.2g} larger "
         f"({LIKELY:.0f} are odds of 20 to 1): record more, or longer"
     )
+
+
+def probability_of_start(models: Sequence[Model]) -> float:
+    """Weight of the starting model, with that of the models that do not contradict it."""
+    start = next(m for m in models if not m.effects and m.curve is None)
+    return sum(m.weight for m in models if m is start or _the_same(m, start))
+
+
+def _the_same(m: Model, chosen: Model) -> bool:
+    """Whether a model only has friction by direction in place of offsets, and is hardly better.
+
+    Except near reversals and at rest the two are one torque, and a note says so.
+    """
+    if m.fit is None or chosen.fit is None or m.score < chosen.score - _BARE:
+        return False
+    further = Counter(m.key) - Counter(chosen.key)
+    kept = Counter(chosen.key) - Counter(m.key) == Counter()
+    exchanged = set(held_offsets(m.fit.loop)) - set(held_offsets(chosen.fit.loop))
+    return kept and 0 < further.total() == len(exchanged)
 
 
 def _improbable(
@@ -68,6 +91,8 @@ def _incomplete(models: Sequence[Model], chosen: Model, worth: float) -> str:
 
     def is_possible(m: Model) -> bool:
         if m.fit is None or m.curve is not None or not mine < Counter(m.key):
+            return False
+        if _the_same(m, chosen):
             return False
         if chosen.held_out is None or m.held_out is None:
             return True
