@@ -8,6 +8,7 @@ import independent as sim
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from loops import four_joints
 from stories import recordings_of
 
 import jaxid
@@ -53,6 +54,47 @@ MISTAKES = {
 def test_a_mistake_is_named(clean, name):
     change, said = MISTAKES[name]
     assert re.search(said, likely_mistake(jaxid.scara(), spoilt(clean, change)))
+
+
+# Sign of position, sign of torque and zero of the second joint of an arm under gravity.
+OF_POSITION = {
+    "position of joint 2 seems to have the wrong sign": (-1.0, 1.0, 0.0),
+    "axis of joint 2 seems to point the other way": (-1.0, -1.0, 0.0),
+    "90 degrees seem to lack in the position of joint 2": (1.0, 1.0, -np.pi / 2),
+}
+
+
+@pytest.mark.parametrize("said", OF_POSITION)
+def test_a_wrong_axis_or_zero_of_a_joint_is_named(elbow, said):
+    loop, recordings = elbow
+    sign, torque, zero = OF_POSITION[said]
+    which = np.eye(loop.joints)[1]
+
+    def change(r):
+        q = r.q * np.where(which, sign, 1.0) + zero * which
+        return {"q": q, "tau": r.tau * np.where(which, torque, 1.0)}
+
+    assert likely_mistake(loop, recordings) == ""
+    assert said in likely_mistake(loop, spoilt(recordings, change))
+
+
+@pytest.fixture(scope="module")
+def elbow():
+    """An arm of four joints as in its URDF, and torque from Pinocchio along two motions."""
+    pinocchio = pytest.importorskip("pinocchio")
+    model = pinocchio.buildModelFromXML(four_joints())
+    data = model.createData()
+    rng, time = np.random.default_rng(4), 0.004 * np.arange(2500)
+    made = []
+    for name in ("one", "two"):
+        rates = 2 * np.pi * rng.uniform(0.1, 0.5, (3, 4))
+        q = 0.3 + np.sum([0.3 * np.sin(np.outer(time, w)) for w in rates], axis=0)
+        v = np.gradient(q, time, axis=0)
+        a = np.gradient(v, time, axis=0)
+        tau = np.array([pinocchio.rnea(model, data, *x) for x in zip(q, v, a, strict=True)])
+        tau = tau + 0.4 * v + 0.01 * np.abs(tau).max(axis=0) * rng.normal(size=tau.shape)
+        made.append(jaxid.Recording.from_arrays(time, q, tau, name=name))
+    return jaxid.serial(four_joints()), jaxid.Recordings.of(made)
 
 
 class Fan(AbstractEffect):

@@ -24,6 +24,8 @@ LARGE_PERCENT = 10.0
 _SHARE, _GOOD = 0.25, 20.0
 # Ratio of the errors with and without a law above which the law is doubtful.
 _BETTER = 3.0
+# Ratio of squared errors below which two corrections are equally good.
+_ALIKE = 1.02
 # Share of samples at the largest torque above which a drive may be at its limit.
 _OFTEN = 0.05
 # Weight of the coefficients of columns of unit length in the regressions.
@@ -37,6 +39,8 @@ _FACTORS = {
     "in mm or mrad, not in m or rad": 1e-3,
     "in m or rad, not in mm or mrad": 1e3,
 }
+# Differences between zero positions of a joint in a file and in its drive, degrees.
+_ZEROS = (90, -90, 180)
 # Factors that correct time stamps.
 _CLOCKS = {
     "in ms, not in s": 1e-3,
@@ -48,9 +52,9 @@ _CLOCKS = {
 def likely_mistake(loop: ClosedLoop, recordings: Recordings) -> str:
     """The mistake in the recordings whose correction improves a regression enough, or empty.
 
-    Signs, units, the order of joints and the clock are tested one at a time. Each is tested by a
-    regression of the inverse dynamics along the filtered motion, with the parameters inside their
-    bounds. Every joint has in addition an inertia of any sign, and a torque that is a cubic
+    Signs, zeros, units, the order of joints and the clock are tested one at a time. Each is tested
+    by a regression of the inverse dynamics along the filtered motion, with the parameters inside
+    their bounds. Every joint has in addition an inertia of any sign, and a torque that is a cubic
     function of its position: wrong bodies may look like a wrong unit, and a missing spring like an
     inertia of the wrong sign.
     """
@@ -63,11 +67,14 @@ def likely_mistake(loop: ClosedLoop, recordings: Recordings) -> str:
     if before is None or np.sqrt(np.mean(before**2)) < LARGE_PERCENT:
         return ""
     found = []
-    for said, mended, faster in _mistakes(recordings, before > LARGE_PERCENT):
+    turns = ~np.array(loop.arm.prismatic())
+    for said, mended, faster in _mistakes(recordings, before > LARGE_PERCENT, turns):
         after = _left(_at_speeds(loop, faster), mended)
         if after is not None and np.sqrt(np.mean(after**2)) < _GOOD:
             found.append((float(np.mean(after**2)), said))
-    size, said = min(found, default=(np.inf, ""))
+    best = min((size for size, _ in found), default=np.inf)
+    # Of mistakes that one motion cannot distinguish, the first one.
+    size, said = next((one for one in found if one[0] <= _ALIKE * best), (np.inf, ""))
     if not size < _SHARE * np.mean(before**2):
         return ""
     return (
@@ -195,13 +202,14 @@ def _of_position(
 
 
 def _mistakes(
-    recordings: Recordings, large: Bool[np.ndarray, " joints"]
+    recordings: Recordings, large: Bool[np.ndarray, " joints"], turns: Bool[np.ndarray, " joints"]
 ) -> Iterator[tuple[str, Recordings, Float[np.ndarray, " joints"]]]:
     """Possible mistakes, each with the corrected recordings, and the factors on their speeds.
 
     **Arguments:**
 
     - `large`: joints with a large error; mistakes of other joints are not tried.
+    - `turns`: joints that turn.
     """
     n = recordings[0].joints
     same = np.ones(n)
@@ -210,6 +218,17 @@ def _mistakes(
     for label, which in chosen:
         mended = _changed(recordings, tau=1 - 2 * which)
         yield f"the torque of {label} seems to have the wrong sign", mended, same
+    for label, which in chosen:
+        sign = 1 - 2 * which
+        mended = _changed(recordings, q=sign)
+        yield f"the position of {label} seems to have the wrong sign", mended, same
+        mended = _changed(recordings, q=sign, tau=sign)
+        said = f"the axis of {label} seems to point the other way (signs of position and torque)"
+        yield said, mended, same
+    for j in np.flatnonzero(large & turns):
+        for angle in _ZEROS:
+            mended = _changed(recordings, zero=np.deg2rad(angle) * np.eye(n)[j])
+            yield f"{angle} degrees seem to lack in the position of joint {j + 1}", mended, same
     for label, which in chosen:
         for unit, factor in _FACTORS.items():
             scale = 1 + (factor - 1) * which
@@ -248,14 +267,15 @@ def _changed(
     q: np.ndarray | float = 1.0,
     tau: np.ndarray | float = 1.0,
     time: float = 1.0,
+    zero: np.ndarray | float = 0.0,
 ) -> Recordings:
-    """Recordings with positions, torques and times multiplied by factors."""
+    """Recordings with positions, torques and times multiplied by factors, and another zero."""
 
     def one(r: Recording) -> Recording:
-        ref = None if r.q_ref is None else r.q_ref * q
+        ref = None if r.q_ref is None else r.q_ref * q + zero
         v = None if r.v is None else r.v * q / time
         return dataclasses.replace(
-            r, time=r.time * time, q=r.q * q, q_ref=ref, v=v, tau=r.tau * tau
+            r, time=r.time * time, q=r.q * q + zero, q_ref=ref, v=v, tau=r.tau * tau
         )
 
     return Recordings.of([one(r) for r in recordings])
