@@ -56,7 +56,7 @@ def write_urdf(
     wrong = [k for k, body in enumerate(masses, start=1) if not _is_physical(body)]
     if wrong:
         warnings.warn(
-            f"the identified bodies of link{'s' * (len(wrong) > 1)} {', '.join(map(str, wrong))} "
+            f"the bodies of link{'s' * (len(wrong) > 1)} {', '.join(map(str, wrong))} "
             f"are not physical, and simulators may refuse {path}: {_NEAREST}",
             JaxidWarning,
             stacklevel=2,
