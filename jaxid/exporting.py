@@ -184,8 +184,8 @@ def _warn_of_the_rest(
         sizes = [p for p in list_parameters(effect) if p.declaration.linear]
         absent = bool(sizes) and not np.any(read_values(effect, sizes))
         if not (carried or absent or isinstance(effect, written)):
-            own = joints.setdefault(effect.effect_name(), [])
-            own += [str(effect.joint)] if hasattr(effect, "joint") else []
+            own, joint = joints.setdefault(effect.effect_name(), []), getattr(effect, "joint", None)
+            own += [] if joint is None else [str(joint)]
     left = [f"{name} on joint {', '.join(own)}" if own else name for name, own in joints.items()]
     if left:
         warnings.warn(
