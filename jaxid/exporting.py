@@ -18,6 +18,11 @@ from .parameters import list_parameters, read_values
 from .simulation.loop import ClosedLoop
 from .simulation.terms import SAID, JointTerms, joint_terms
 
+# What to do about bodies that are not physical.
+_NEAREST = "give bodies=jaxid.arms.physical_bodies(arm, covariance).bodies"
+# Relative error of an inertia by rounding.
+_ROUNDED = 1e-9
+
 
 def write_urdf(
     loop: ClosedLoop,
@@ -146,11 +151,6 @@ def write_mjcf(
     ElementTree.indent(root)
     Path(path).write_text(ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
     return Path(path)
-
-
-_NEAREST = "give bodies=jaxid.arms.physical_bodies(arm, covariance).bodies"
-# Relative error of an inertia by rounding.
-_ROUNDED = 1e-9
 
 
 def _is_physical(body: Float[np.ndarray, "10"]) -> bool:

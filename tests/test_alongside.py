@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from independent import effects as fx
 from loops import four_joints, scara
-from stories import recordings_of
+from stories import recordings_of, silent
 
 import jaxid
 from jaxid import Stepping
 from jaxid.control import PD, OpenLoop, Sampled, Tracking
 from jaxid.discovery import alongside
-from jaxid.discovery.alongside import along_recorded, in_the_loop, sampled_law
+from jaxid.discovery.alongside import along_recorded, delays_of_drives, in_the_loop
+from jaxid.discovery.ranking import judge
+from jaxid.discovery.screening import screen
 from jaxid.effects import JointElasticity, TorqueOffset
 
 LAW = PD(Kp=[800.0, 600.0, 3000.0, 90.0], Kv=[80.0, 60.0, 300.0, 9.0])
@@ -64,19 +66,21 @@ def test_a_search_continues_along_the_recorded_motion_after_the_first_fit(subste
 
 
 def test_drives_are_late_under_a_sampled_law():
-    late = sampled_law(fitted(effects=[OFFSET], controller=sim.SampledPD(period=0.01)))
+    late = delays(effects=[OFFSET], controller=sim.SampledPD(period=0.01))
     assert late == pytest.approx([5e-3, 5e-3], rel=0.3)
 
 
 @pytest.mark.parametrize("effects", [[], [OFFSET], [fx.TimeDelay(joint=1, delay=5e-3)]])
 def test_a_single_late_drive_is_no_sampled_law(effects):
-    assert sampled_law(fitted(effects=effects)) == ()
+    assert delays(effects=effects) == ()
 
 
-def fitted(**case) -> jaxid.Fit:
-    """The fit of a SCARA under a continuous law to two simulations."""
+def delays(**case) -> tuple[float, ...]:
+    """The delays of the drives in a fit of a SCARA under a continuous law."""
     recordings, _ = recordings_of(sim.make_case(5, duration=8.0, **case))
-    return jaxid.fit(jaxid.scara(), recordings)
+    fit = jaxid.fit(jaxid.scara(), recordings)
+    screened = screen(fit, [TorqueOffset], silent)
+    return delays_of_drives(judge(fit, screened, 0.01), screened.system)
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ def test_a_mistake_is_named(clean, name):
 OF_POSITION = {
     "position of joint 2 seems to have the wrong sign": (-1.0, 1.0, 0.0),
     "axis of joint 2 seems to point the other way": (-1.0, -1.0, 0.0),
-    "90 degrees seem to lack in the position of joint 2": (1.0, 1.0, -np.pi / 2),
+    "position of joint 2 seems to be off by -90 degrees": (1.0, 1.0, -np.pi / 2),
 }
 
 

@@ -15,8 +15,8 @@ from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..simulation.steps import UNROLLED, needed_substeps
 from .comparison import compare
+from .diagnosis import Diagnosis
 from .explore import DECISIVE
-from .likelihood import noise_filters
 from .predict import Predictor
 from .system import System
 
@@ -37,40 +37,44 @@ def along_recorded(loop: ClosedLoop) -> ClosedLoop:
     their own, which only a simulation gives.
     """
     slow = loop.joints > UNROLLED or loop.controller.period is not None
-    return _without_law(loop) if slow else loop
+    return without_law(loop) if slow else loop
 
 
-def along_after(first: Fit, wrong: str) -> tuple[ClosedLoop, str]:
-    """The loop in which the search continues after the fit of the starting model, and a note why.
+def slow_or_wrong(first: Fit, wrong: str) -> str:
+    """Why the search goes on without the law after the fit of the starting model; empty if not.
 
     Under a continuous law the fit shows whether simulations are slow: an arm that sticks needs up
-    to a hundred steps between two samples. It also shows whether the law is sampled.
+    to a hundred steps between two samples.
 
     **Arguments:**
 
     - `wrong`: why the law is doubtful; empty if it is not.
     """
-    loop = first.loop
-    along = _without_law(loop)
-    if along is loop or first.mistake or first.status is Status.misfit:
-        return loop, ""
-    if (loop.stepping.substeps or 1) > _STEPS:
-        why = f"the starting model needs more than {_STEPS} steps between two samples, so"
-    elif wrong:
-        why = "the law is doubtful, so"
-    elif late := sampled_law(first):
-        delays = ", ".join(f"{1e3 * x:.2g}" for x in late)
-        why = (
-            f"the torques seem to act {delays} ms late, like a law that is sampled and held, "
-            "although the law is declared as continuous: declare it by "
-            "jaxid.control.Sampled(law, every=...); until then,"
-        )
-    else:
-        return loop, ""
-    return along, f"{why} sets of effects are compared along the recorded motion, without the law"
+    if first.mistake or first.status is Status.misfit:
+        return ""
+    if (first.loop.stepping.substeps or 1) > _STEPS:
+        return f"the starting model needs more than {_STEPS} steps between two samples, so"
+    return "the law is doubtful, so" if wrong else ""
 
 
-def _without_law(loop: ClosedLoop) -> ClosedLoop:
+def sampled(diagnosis: Diagnosis, system: System) -> str:
+    """Why the search goes on without the law if it seems to be sampled; empty if it does not.
+
+    **Arguments:**
+
+    - `diagnosis`: of a fit under a continuous law. `system`: its linear system.
+    """
+    late = delays_of_drives(diagnosis, system)
+    if not late:
+        return ""
+    return (
+        f"the torques seem to act {', '.join(f'{1e3 * x:.2g}' for x in late)} ms late, like a law "
+        "that is sampled and held, although the law is declared as continuous: declare it by "
+        "jaxid.control.Sampled(law, every=...); until then,"
+    )
+
+
+def without_law(loop: ClosedLoop) -> ClosedLoop:
     """The loop along its recorded motion; unchanged if that is not possible."""
     law = loop.controller
     if law.imposes or law.judged != "torque":
@@ -79,16 +83,19 @@ def _without_law(loop: ClosedLoop) -> ClosedLoop:
     return along if imposed(along) else loop
 
 
-def sampled_law(fit: Fit) -> tuple[float, ...]:
+def delays_of_drives(diagnosis: Diagnosis, system: System) -> tuple[float, ...]:
     """Delays of the drives, s, if all are late as under a sampled law; empty if they are not.
 
-    The delays are estimated in the linear system of a fit under a continuous law. A single drive
-    that is late is an effect. With one joint the two are the same.
+    The delays are estimated together in the linear system. A single drive that is late is an
+    effect. With one joint the two are the same.
+
+    **Arguments:** those of `sampled`.
     """
-    loop, period = fit.loop, fit.recordings.common_period()
-    if loop.joints < 2 or loop.controller.period is not None:
+    loop, period = system.loop, diagnosis.fit.recordings.common_period()
+    law = loop.controller
+    if loop.joints < 2 or law.period is not None or law.imposes or law.judged != "torque":
         return ()
-    predictor = Predictor.of(System.of(fit), noise_filters(fit.residuals))
+    predictor = Predictor.of(system, diagnosis.noise, diagnosis.data.level)
     drives = [TimeDelay(joint=j + 1, delay=jnp.asarray(period / 2)) for j in range(loop.joints)]
     nothing, late = predictor.predict(()), predictor.predict(drives)
     rows = int(predictor.data.mask.sum()) * predictor.data.residual.shape[2]

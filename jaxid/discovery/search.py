@@ -14,7 +14,7 @@ from ..estimate.mistakes import doubtful_law
 from ..noise import ARFilter
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
-from .alongside import along_after
+from .alongside import sampled, slow_or_wrong, without_law
 from .diagnosis import Diagnosis, over_recordings, share_left
 from .examined import Examined
 from .explore import DECISIVE, Candidate, explore, key_of, largest_first
@@ -108,12 +108,12 @@ class Search(Examined):
         self.watched.begin("fit", "fit of the starting model")
         first = self.fits.start(loop)
         self.refuted = doubtful_law(first)
-        along, self.why = along_after(first, self.refuted)
-        if self.why:
-            self.note(self.why)
-            self.given = loop = dataclasses.replace(loop, controller=along.controller)
-            first = self.fits.start(loop, "start along the recorded motion")
+        first = self._along(first, slow_or_wrong(first, self.refuted))
         screened, diagnosis = self._screened(first, ())
+        again = self._along(first, "" if first.mistake else sampled(diagnosis, screened.system))
+        if again is not first:
+            first, self.forms = again, 0
+            screened, diagnosis = self._screened(first, ())
         if first.mistake:
             # Effects would only approximate the mistake.
             return self.visit((), first)
@@ -129,6 +129,16 @@ class Search(Examined):
         else:
             self.latest = self._screened(fit, (), carried(screened, first, fit))
         return self.visit((), fit)
+
+    def _along(self, first: Fit, why: str) -> Fit:
+        """The fit of the starting model along the recorded motion if there is a reason for it."""
+        along = without_law(first.loop)
+        if not why or along is first.loop:
+            return first
+        self.why = f"{why} sets of effects are compared along the recorded motion, without the law"
+        self.note(self.why)
+        self.given = dataclasses.replace(self.given, controller=along.controller)
+        return self.fits.start(self.given, "start along the recorded motion")
 
     def _screened(
         self, fit: Fit, effects: Sequence[AbstractEffect], known: Screened | None = None

@@ -36,7 +36,7 @@ def undecided(
         share = probability_of_start(models)
         if share >= _HALF:
             return ""
-        rival = next(m for m in models if m is not start)
+        rival = next(m for m in models if m is not start and not _the_same(m, start))
         return (
             f"the starting model has a probability of only {share:.2g}, and "
             f"{rival.label} has {rival.weight:.2g}: record more, or longer"

@@ -190,7 +190,7 @@ def _examined(found: Fit, loop: ClosedLoop) -> Fit:
     largest = float((found.error_percent * _of_motion(found)).to_numpy().max())
     mistake = "" if largest < LARGE_PERCENT else likely_mistake(loop, found.recordings)
     mistake = mistake or _unrelated(found) or _limited(found) or contradiction(found)
-    said = mistake or (doubtful_law(found) if largest >= LARGE_PERCENT else "")
+    said = mistake or doubtful_law(found)
     notes = (said, *found.notes) if said else found.notes
     return dataclasses.replace(found, mistake=mistake, notes=notes)
 

@@ -91,6 +91,8 @@ def doubtful_law(found: Fit) -> str:
     law, recordings = found.loop.controller, found.recordings
     if law.imposes or law.judged != "torque" or not found.status.simulated:
         return ""
+    if found.error_percent.to_numpy().max() < LARGE_PERCENT:
+        return ""
     if [len(x) for x in found.residuals] != [len(r.tau) for r in recordings]:
         # A regression does not simulate the loop.
         return ""
@@ -228,7 +230,8 @@ def _mistakes(
     for j in np.flatnonzero(large & turns):
         for angle in _ZEROS:
             mended = _changed(recordings, zero=np.deg2rad(angle) * np.eye(n)[j])
-            yield f"{angle} degrees seem to lack in the position of joint {j + 1}", mended, same
+            said = f"the position of joint {j + 1} seems to be off by {-angle} degrees"
+            yield said, mended, same
     for label, which in chosen:
         for unit, factor in _FACTORS.items():
             scale = 1 + (factor - 1) * which
