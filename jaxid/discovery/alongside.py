@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..control import Tracking
-from ..effects import TimeDelay
+from ..effects import ActuatorLag, TimeDelay
 from ..errors import FitError, ModelError
 from ..estimate import Fit, Status
 from ..recording import Recordings
@@ -16,14 +16,17 @@ from ..simulation.loop import ClosedLoop
 from ..simulation.steps import UNROLLED, needed_substeps
 from .comparison import compare
 from .diagnosis import Diagnosis
-from .explore import DECISIVE
 from .predict import Predictor
-from .system import System
+from .ranking import Screened
+from .score import Whitened, strong_directions
+from .separate import columns_of, select
 
 # Largest delay of a torque in samples that a sampled law explains.
 LATE = 2.0
 # Smallest significant delay, in standard deviations.
 _SURE = 3.0
+# Effects on a joint that are the same as the delay of its drive.
+_LAGS = (TimeDelay, ActuatorLag)
 # Steps between two grid points up to which a simulation is fast enough.
 _STEPS = 16
 
@@ -57,14 +60,14 @@ def slow_or_wrong(first: Fit, wrong: str) -> str:
     return "the law is doubtful, so" if wrong else ""
 
 
-def sampled(diagnosis: Diagnosis, system: System) -> str:
+def sampled(diagnosis: Diagnosis, screened: Screened) -> str:
     """Why the search goes on without the law if it seems to be sampled; empty if it does not.
 
     **Arguments:**
 
-    - `diagnosis`: of a fit under a continuous law. `system`: its linear system.
+    - `diagnosis`: of a fit under a continuous law. `screened`: its linear system and hypotheses.
     """
-    late = delays_of_drives(diagnosis, system)
+    late = delays_of_drives(diagnosis, screened)
     if not late:
         return ""
     return (
@@ -83,27 +86,42 @@ def without_law(loop: ClosedLoop) -> ClosedLoop:
     return along if imposed(along) else loop
 
 
-def delays_of_drives(diagnosis: Diagnosis, system: System) -> tuple[float, ...]:
+def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, ...]:
     """Delays of the drives, s, if all are late as under a sampled law; empty if they are not.
 
-    The delays are estimated together in the linear system. A single drive that is late is an
+    The delays are estimated together in the linear system. Any missing effect leaves a residual
+    that delays explain in part, so they compete with the effects and curves of the catalogue and
+    are estimated beside those that are selected with them. A single drive that is late is an
     effect. With one joint the two are the same.
 
     **Arguments:** those of `sampled`.
     """
-    loop, period = system.loop, diagnosis.fit.recordings.common_period()
+    loop, period = screened.system.loop, diagnosis.fit.recordings.common_period()
     law = loop.controller
     if loop.joints < 2 or law.period is not None or law.imposes or law.judged != "torque":
         return ()
-    predictor = Predictor.of(system, diagnosis.noise, diagnosis.data.level)
+    data = dataclasses.replace(screened.data, level=diagnosis.data.level)
+    predictor = Predictor.of(screened.system, diagnosis.noise, data.level)
     drives = [TimeDelay(joint=j + 1, delay=jnp.asarray(period / 2)) for j in range(loop.joints)]
-    nothing, late = predictor.predict(()), predictor.predict(drives)
-    rows = int(predictor.data.mask.sum()) * predictor.data.residual.shape[2]
-    gain = rows * np.log(nothing.loss / late.loss) - len(drives) * np.log(rows)
-    if not late.possible or gain < DECISIVE:
+    late = predictor.predict(drives)
+    if not late.possible:
         return ()
+    white = Whitened.of(data, diagnosis.noise)
+    known = white.signatures.shape[1]
+    white = white.beside(late.slopes)
+    blocks = [h.columns for h in screened.hypotheses if not isinstance(h.effect, _LAGS)]
+    own = len(blocks)
+    chosen = select(white, [*blocks, range(known, known + len(drives))])
+    if own not in chosen:
+        return ()
+    others = white.signatures[:, columns_of(blocks, [k for k in chosen if k != own])]
+    basis = strong_directions(others.astype(float))
+    alone = late.slopes - basis @ (basis.T @ late.slopes)
+    inverse = np.linalg.pinv(alone.T @ alone)
     found = np.array([float(e.delay) for e in late.effects if isinstance(e, TimeDelay)])
-    std = np.sqrt(np.diag(np.linalg.pinv(late.slopes.T @ late.slopes)) * late.loss / rows)
+    found = found + inverse @ (alone.T @ late.residual)
+    rest = late.residual - basis @ (basis.T @ late.residual)
+    std = np.sqrt(np.diag(inverse) * (rest @ rest) / white.count)
     sure = np.all((found > _SURE * std) & (std > 0) & (found < LATE * period))
     return tuple(found.tolist()) if sure else ()
 

@@ -59,6 +59,14 @@ class Whitened(eqx.Module):
         count = rows - unknown - basis.shape[1]
         return cls(r, x, size.astype(float), float(count))
 
+    def beside(self, columns: Float[np.ndarray, "rows more"]) -> "Whitened":
+        """The same with more signatures, which are whitened and without the base already."""
+        size = np.linalg.norm(columns, axis=0)
+        size[size == 0] = 1.0
+        more = (columns / size).astype(self.signatures.dtype)
+        signatures = np.concatenate([self.signatures, more], axis=1)
+        return Whitened(self.residual, signatures, np.append(self.size, size), self.count)
+
     def score(self) -> Float[np.ndarray, " columns"]:
         """Products of signatures and residual."""
         return (self.residual.astype(self.signatures.dtype) @ self.signatures).astype(float)

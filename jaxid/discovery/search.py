@@ -110,7 +110,7 @@ class Search(Examined):
         self.refuted = doubtful_law(first)
         first = self._along(first, slow_or_wrong(first, self.refuted))
         screened, diagnosis = self._screened(first, ())
-        again = self._along(first, "" if first.mistake else sampled(diagnosis, screened.system))
+        again = self._along(first, "" if first.mistake else sampled(diagnosis, screened))
         if again is not first:
             first, self.forms = again, 0
             screened, diagnosis = self._screened(first, ())
