@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -15,8 +14,9 @@ from ..control import Reading, Sampled
 from ..effects import AbstractEffect, AbstractTransmission, check_declared
 from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
-from ..simulation.batch import at_rest, motion_cutoff
+from ..simulation.batch import at_rest, motion_cutoff, prepare
 from ..simulation.checks import check_joints, check_law
+from ..simulation.integrals import integral_states
 from ..simulation.loop import ClosedLoop
 from ..simulation.sharing import with_one_blas_thread
 from .drawn import contradiction
@@ -75,7 +75,7 @@ def fit(
     found = _followed(_doubted(_examined(_without_nan(found), loop)))
     notes = (*found.notes, *_matter(found), *drawing_note(found), *_band(loop, recordings))
     notes = (*notes, *slow_note(given, found.loop), *_gaps(recordings))
-    notes = (*notes, *_restarted(loop, recordings))
+    notes = (*notes, *_begun(loop, recordings))
     return dataclasses.replace(found, notes=notes)
 
 
@@ -131,21 +131,29 @@ def _band(loop: ClosedLoop, recordings: Recordings) -> list[str]:
     return [f"torque is compared below {cutoff:.3g} Hz, up to which the recorded motion is known"]
 
 
-def _restarted(loop: ClosedLoop, recordings: Recordings) -> list[str]:
-    """A note on recordings in whose midst a law with states of its own begins anew."""
+def _begun(loop: ClosedLoop, recordings: Recordings) -> list[str]:
+    """Notes on the states that the law has at the first sample of the recordings."""
     law, zeros = loop.controller, jnp.zeros(loop.joints)
     law = law.law if isinstance(law, Sampled) else law
-    own = jax.tree.leaves(law.initial_state(Reading(zeros, zeros)))
+    own = law.initial_state(Reading(zeros, zeros)).size
+    integrals = int(integral_states(loop).sum())
     moving = [r.name for r in recordings if not at_rest(r)]
-    if not moving or not sum(leaf.size for leaf in own):
-        return []
-    many = f"{len(moving)} of {len(recordings)} recordings begin in motion, such as {moving[0]}"
-    one = f"{moving[0]} begins in motion"
-    return [
-        f"{one if len(recordings) == 1 else many}: {type(law).__name__} is simulated as if it were "
-        "switched on there, with integrals at zero; begin a recording where the law is switched "
-        "on, or where the arm has been at rest"
-    ]
+    who, notes = type(law).__name__, []
+    if integrals:
+        held = np.asarray(prepare(loop, recordings).intervals.integrals)[:, 0]
+        names = [r.name for r, row in zip(recordings, held, strict=True) if row.any()]
+        if names:
+            notes.append(
+                f"the integral of {who} is not zero at the first sample of {', '.join(names)}: "
+                "its value there follows from the recorded torque"
+            )
+    if own > integrals and law.period is None and moving:
+        notes.append(
+            f"{who} has {own - integrals} states that are no integrals, and {', '.join(moving)} "
+            "begins in motion: there they start as if the law were switched on, so begin a "
+            "recording where the arm has been at rest"
+        )
+    return notes
 
 
 def _gaps(recordings: Recordings) -> list[str]:

@@ -17,6 +17,7 @@ from ..recording import Recording, Recordings
 from ..signals.smoothing import Band, shared_length, signal_cutoff
 from .checks import check_joints
 from .compared import compared_part
+from .integrals import Along, integral_states, integrals_at_start
 from .loop import ClosedLoop
 
 
@@ -27,6 +28,7 @@ class Interval(eqx.Module):
     the signals that are constant in the interval, by name, `(joints,)` each. `noise` and `rate` are
     added to the position and velocity that the sensors read, `push` and `pull` to the torque on
     drives and links. Each of the four is given at both ends and is linear in between, or is None.
+    `integrals` is added to the law's states at the start of the recording, or is None.
     """
 
     t0: Float[Array, ""]
@@ -40,6 +42,7 @@ class Interval(eqx.Module):
     rate: Float[Array, "2 joints"] | None = None
     push: Float[Array, "2 joints"] | None = None
     pull: Float[Array, "2 joints"] | None = None
+    integrals: Float[Array, " states"] | None = None
 
 
 class Batch(eqx.Module):
@@ -256,6 +259,8 @@ def prepare(
         _drive(loop, r, g, length, e, held)
         for r, g, e in zip(recordings, grids, noises, strict=True)
     ]
+    if integral_states(loop).any():
+        rows = _with_integrals(loop, recordings, grids, rows)
     fields = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
     # The structure is that of one interval; the values are already in place.
     one = Interval(*jax.device_put(jax.tree.map(lambda leaf: leaf[0, 0], fields)))
@@ -286,6 +291,26 @@ def prepare(
         band,
         moving_of(loop, recordings, band),
     )
+
+
+def _with_integrals(
+    loop: ClosedLoop,
+    recordings: Recordings | Sequence[Recording],
+    grids: Sequence[tuple[np.ndarray, np.ndarray]],
+    rows: Sequence[tuple[Any, ...]],
+) -> list[tuple[Any, ...]]:
+    """The fields of `_drive` with the states that the law's integrals have at the start."""
+    along = []
+    for recording, (grid, tick), row in zip(recordings, grids, rows, strict=True):
+        c0, c1, c2, _ = np.moveaxis(row[4][: len(grid)], 1, 0)
+        reference = np.stack([c0, c1, 2 * c2, row[5][: len(grid), 0]], axis=1)
+        held = {name: x[: len(grid)] for name, x in row[6].items()}
+        along.append(Along.of(recording, grid, tick, reference, held))
+    states = integrals_at_start(loop, along)
+    return [
+        (*row, None, None, np.tile(state, (len(row[0]), 1)))
+        for row, state in zip(rows, states, strict=True)
+    ]
 
 
 def band_of(loop: ClosedLoop, recordings: Recordings | Sequence[Recording]) -> Band | None:

@@ -88,6 +88,9 @@ def initial(
     first = jax.tree.map(lambda leaf: leaf[0], intervals)
     reference = _reference(first, jnp.zeros(()))
     start = rest(loop, *behind(loop, q, v))
+    if first.integrals is not None:
+        held = start.controller + first.integrals
+        start = dataclasses.replace(start, controller=held)
     return ravel_pytree(settle(loop, first.t0, start, reference, first.label))[0]
 
 
