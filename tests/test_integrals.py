@@ -141,7 +141,8 @@ class Filtered(AbstractController):
         return jnp.concatenate([reference.q - reading.q, 50.0 * (reading.v - state[1:])])
 
     def command(self, reading, reference, state, mass):
-        return 60.0 * (reference.q - reading.q) + 90.0 * state[:1] - 9.0 * state[1:]
+        error, rate = reference.q - reading.q, reference.v - state[1:]
+        return 60.0 * error + 90.0 * state[:1] + 9.0 * rate
 
 
 @pytest.mark.parametrize(
@@ -171,3 +172,9 @@ class Filtered(AbstractController):
 )
 def test_integrals_are_the_states_whose_rate_depends_on_no_state(law, which):
     assert integral_states(pendulum(law)).tolist() == which
+
+
+def test_states_that_are_no_integrals_are_told_if_the_arm_moves():
+    fit = jaxid.fit(pendulum(Filtered()), recorded(3.0, 9.0))
+    assert any("Filtered has states that are no integrals" in note for note in fit.notes)
+    assert any("the integral of Filtered is not zero" in note for note in fit.notes)

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ..control import Tracking
-from ..effects import ActuatorLag, TimeDelay
+from ..effects import AbstractTransmission, ActuatorLag, TimeDelay
 from ..errors import FitError, ModelError
 from ..estimate import Fit, Status
 from ..recording import Recordings
@@ -16,7 +17,8 @@ from ..simulation.loop import ClosedLoop
 from ..simulation.steps import UNROLLED, needed_substeps
 from .comparison import compare
 from .diagnosis import Diagnosis
-from .predict import Predictor
+from .explore import DECISIVE
+from .predict import Prediction, Predictor
 from .ranking import Screened
 from .score import Whitened, strong_directions
 from .separate import columns_of, select
@@ -25,8 +27,8 @@ from .separate import columns_of, select
 LATE = 2.0
 # Smallest significant delay, in standard deviations.
 _SURE = 3.0
-# Effects on a joint that are the same as the delay of its drive.
-_LAGS = (TimeDelay, ActuatorLag)
+# Effects that are the same as the delay of a drive, or approximate it.
+_LAGS = (TimeDelay, ActuatorLag, AbstractTransmission)
 # Steps between two grid points up to which a simulation is fast enough.
 _STEPS = 16
 
@@ -103,8 +105,10 @@ def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, .
     data = dataclasses.replace(screened.data, level=diagnosis.data.level)
     predictor = Predictor.of(screened.system, diagnosis.noise, data.level)
     drives = [TimeDelay(joint=j + 1, delay=jnp.asarray(period / 2)) for j in range(loop.joints)]
-    late = predictor.predict(drives)
-    if not late.possible:
+    nothing, late = predictor.predict(()), predictor.predict(drives)
+    rows = int(data.mask.sum()) * data.residual.shape[2]
+    gain = rows * np.log(nothing.loss / late.loss) - len(drives) * np.log(rows)
+    if not late.possible or gain < DECISIVE:
         return ()
     white = Whitened.of(data, diagnosis.noise)
     known = white.signatures.shape[1]
@@ -115,15 +119,26 @@ def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, .
     if own not in chosen:
         return ()
     others = white.signatures[:, columns_of(blocks, [k for k in chosen if k != own])]
-    basis = strong_directions(others.astype(float))
-    alone = late.slopes - basis @ (basis.T @ late.slopes)
-    inverse = np.linalg.pinv(alone.T @ alone)
-    found = np.array([float(e.delay) for e in late.effects if isinstance(e, TimeDelay)])
-    found = found + inverse @ (alone.T @ late.residual)
-    rest = late.residual - basis @ (basis.T @ late.residual)
-    std = np.sqrt(np.diag(inverse) * (rest @ rest) / white.count)
+    found, std = _beside(late, strong_directions(others.astype(float)))
     sure = np.all((found > _SURE * std) & (std > 0) & (found < LATE * period))
     return tuple(found.tolist()) if sure else ()
+
+
+def _beside(
+    late: Prediction, others: Float[np.ndarray, "rows columns"]
+) -> tuple[Float[np.ndarray, " joints"], Float[np.ndarray, " joints"]]:
+    """Delays, s, that are estimated together with other effects, and their deviations.
+
+    **Arguments:**
+
+    - `late`: the delays without others. `others`: orthonormal columns of the other effects.
+    """
+    slopes = late.slopes - others @ (others.T @ late.slopes)
+    rest = late.residual - others @ (others.T @ late.residual)
+    inverse = np.linalg.pinv(slopes.T @ slopes)
+    alone = np.array([float(e.delay) for e in late.effects if isinstance(e, TimeDelay)])
+    found = alone + inverse @ (slopes.T @ late.residual)
+    return found, np.sqrt(np.diag(inverse) * (rest @ rest) / len(rest))
 
 
 def in_the_loop(loop: ClosedLoop, models: Sequence[ClosedLoop], recordings: Recordings) -> str:

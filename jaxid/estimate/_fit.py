@@ -149,9 +149,9 @@ def _begun(loop: ClosedLoop, recordings: Recordings) -> list[str]:
             )
     if own > integrals and law.period is None and moving:
         notes.append(
-            f"{who} has {own - integrals} states that are no integrals, and {', '.join(moving)} "
-            "begins in motion: there they start as if the law were switched on, so begin a "
-            "recording where the arm has been at rest"
+            f"{who} has states that are no integrals, which start as `initial_state` gives them, "
+            f"although the arm moves at the first sample of {', '.join(moving)}: begin a recording "
+            "where it has been at rest"
         )
     return notes
 
