@@ -178,3 +178,11 @@ def test_states_that_are_no_integrals_are_told_if_the_arm_moves():
     fit = jaxid.fit(pendulum(Filtered()), recorded(3.0, 9.0))
     assert any("Filtered has states that are no integrals" in note for note in fit.notes)
     assert any("the integral of Filtered is not zero" in note for note in fit.notes)
+
+
+def test_windows_begin_with_the_integrals_of_the_recording():
+    law = Sampled(PID(**GAINS), every=4e-3)
+    recording = recorded(3.0, 9.0, 4e-3)
+    fit = jaxid.fit(pendulum(law), recording, jaxid.OEM(window=1.5))
+    assert not any("start at rest" in note for note in fit.notes)
+    assert np.abs((fit.theta - [TRUE[name] for name in fit.names]) / fit.std).max() < 4

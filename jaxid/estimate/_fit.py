@@ -4,19 +4,18 @@ import dataclasses
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ..arms import SerialArm, physical_bodies
 from ..arms.physical import chance_of
-from ..control import Reading, Sampled
+from ..control import Sampled
 from ..effects import AbstractEffect, AbstractTransmission, check_declared
 from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
 from ..simulation.batch import at_rest, motion_cutoff, prepare
 from ..simulation.checks import check_joints, check_law
-from ..simulation.integrals import integral_states
+from ..simulation.integrals import has_other_states, integral_states
 from ..simulation.loop import ClosedLoop
 from ..simulation.sharing import with_one_blas_thread
 from .drawn import contradiction
@@ -133,13 +132,10 @@ def _band(loop: ClosedLoop, recordings: Recordings) -> list[str]:
 
 def _begun(loop: ClosedLoop, recordings: Recordings) -> list[str]:
     """Notes on the states that the law has at the first sample of the recordings."""
-    law, zeros = loop.controller, jnp.zeros(loop.joints)
-    law = law.law if isinstance(law, Sampled) else law
-    own = law.initial_state(Reading(zeros, zeros)).size
-    integrals = int(integral_states(loop).sum())
-    moving = [r.name for r in recordings if not at_rest(r)]
-    who, notes = type(law).__name__, []
-    if integrals:
+    law = loop.controller
+    who = type(law.law if isinstance(law, Sampled) else law).__name__
+    notes = []
+    if integral_states(loop).any():
         held = np.asarray(prepare(loop, recordings).intervals.integrals)[:, 0]
         names = [r.name for r, row in zip(recordings, held, strict=True) if row.any()]
         if names:
@@ -147,7 +143,8 @@ def _begun(loop: ClosedLoop, recordings: Recordings) -> list[str]:
                 f"the integral of {who} is not zero at the first sample of {', '.join(names)}: "
                 "its value there follows from the recorded torque"
             )
-    if own > integrals and law.period is None and moving:
+    moving = [r.name for r in recordings if not at_rest(r)]
+    if moving and has_other_states(loop):
         notes.append(
             f"{who} has states that are no integrals, which start as `initial_state` gives them, "
             f"although the arm moves at the first sample of {', '.join(moving)}: begin a recording "

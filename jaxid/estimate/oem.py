@@ -7,15 +7,13 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from ..control import Reading
 from ..display.progress import working
 from ..recording import Recordings
 from ..simulation.batch import Batch, prepare
+from ..simulation.integrals import has_other_states
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import simulate
 from ..simulation.steps import set_substeps, with_substeps
@@ -121,10 +119,8 @@ class OEM(AbstractMethod):
         """A note on states that are reset in every window."""
         if self.window is None:
             return []
-        zeros = jnp.zeros(loop.joints)
         own = [e.effect_name() for e in loop.effects if e.initial_state().size]
-        law = loop.controller.initial_state(Reading(zeros, zeros))
-        own += [type(loop.controller).__name__] if sum(x.size for x in jax.tree.leaves(law)) else []
+        own += [type(loop.controller).__name__] if has_other_states(loop) else []
         if not own:
             return []
         said = "in every window the states of {} start at rest, which may bias the estimates"

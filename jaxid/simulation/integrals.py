@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..compiling import compiled
-from ..control import Reading, Reference
+from ..control import Reading, Reference, Sampled
 from ..recording import Recording
 from .loop import ClosedLoop
 
@@ -75,6 +75,17 @@ def integral_states(loop: ClosedLoop) -> Bool[np.ndarray, " states"]:
         return ~np.any(np.asarray(rates), axis=1)
     after = jax.jacfwd(lambda s: law.tick(reading, reference, s))(state)
     return np.all(np.asarray(after) == np.eye(state.size), axis=1)
+
+
+def has_other_states(loop: ClosedLoop) -> bool:
+    """Whether the law has states of its own that no recording shows: those of filters."""
+    law = loop.controller
+    law = law.law if isinstance(law, Sampled) else law
+    if law.period is not None:
+        # Readings and commands of the last ticks.
+        return False
+    zeros = jnp.zeros(loop.joints)
+    return law.initial_state(Reading(zeros, zeros)).size > int(integral_states(loop).sum())
 
 
 def integrals_at_start(
