@@ -13,7 +13,7 @@ import pytest
 import scipy
 
 import jaxid
-from jaxid.control import PD, AbstractController, Cascade, OpenLoop, Sampled, Tracking
+from jaxid.control import PD, PID, AbstractController, Cascade, OpenLoop, Sampled, Tracking
 from jaxid.effects import Motion
 from jaxid.errors import ModelError, RecordingError
 from jaxid.simulation.loads import inverse
@@ -357,10 +357,16 @@ def test_laws_of_other_joints_are_refused():
     time = np.linspace(0, 3, 301)
     q = np.stack([np.sin(2 * time), np.cos(3 * time)], axis=1)
     recording = jaxid.Recording.from_arrays(time, q, q, q_ref=q, name="one")
-    for law in (PD(Kp=[9.0, 9.0, 9.0], Kv=1.0), jaxid.emps().controller):
+    three = [9.0, 9.0, 9.0]
+    for law, why in (
+        (PD(Kp=three, Kv=1.0), "set all gains: Kp has 3 values"),
+        (PID(Kp=1.0, Ki=three, Kd=three), "set all gains: Ki has 3 values, Kd has 3 values"),
+        (Sampled(PD(Kp=1.0, Kv=three), every=1e-3), "set all gains: Kv has 3 values"),
+        (jaxid.emps().controller, "of shape|set all gains"),
+    ):
         loop = dataclasses.replace(jaxid.scara(), controller=law)
-        for work in (jaxid.simulate, jaxid.fit):
-            with pytest.raises(ModelError, match="of scara gives no torque for 2 joints"):
+        for work in (jaxid.simulate, jaxid.fit, jaxid.compare):
+            with pytest.raises(ModelError, match=f"of scara gives .*2 joints.*{why}"):
                 work(loop, recording)
     for noise in ([], [np.zeros((300, 2))]):
         with pytest.raises(RecordingError, match="noise"):
@@ -391,3 +397,32 @@ def test_laws_whose_states_never_change_are_refused(every, method):
     loop = dataclasses.replace(jaxid.scara(), controller=Counting(every))
     with pytest.raises(ModelError, match=f"has 2 states and .*: write `{method}`"):
         jaxid.simulate(loop, recording)
+
+
+class Halved(Counting):
+    """A law whose derivative lacks a state."""
+
+    def derivative(self, reading, reference, state):
+        return state[:1]
+
+
+class Paired(Halved):
+    """A law with two vectors of states."""
+
+    def initial_state(self, reading):
+        return jnp.zeros(1), jnp.zeros(1)
+
+    def command(self, reading, reference, state, mass):
+        return reference.q - reading.q + state[0]
+
+
+@pytest.mark.parametrize(
+    ("law", "why"),
+    [(Halved(), r"has 2 states, but `derivative` gives \(1,\)"), (Paired(), "than one vector")],
+)
+def test_laws_with_states_of_a_wrong_form_are_refused(law, why):
+    time = np.linspace(0, 3, 301)
+    q = np.stack([np.sin(2 * time), np.cos(3 * time)], axis=1)
+    recording = jaxid.Recording.from_arrays(time, q, q, q_ref=q)
+    with pytest.raises(ModelError, match=why):
+        jaxid.simulate(dataclasses.replace(jaxid.scara(), controller=law), recording)

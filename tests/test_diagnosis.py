@@ -171,6 +171,9 @@ def test_next_experiment_keeps_its_limits_and_separates(offset_story):
     assert np.all(proposed.recording.q_ref <= limits.high + 1e-9)
     assert np.all(np.abs(proposed.recording.tau) <= 1.05 * limits.torque)
     assert proposed.then > 0
+    better, worse = (dataclasses.replace(proposed, now=x * proposed.then) for x in (0.5, 1.0))
+    assert "worth less" not in repr(better)
+    assert "worth less than what is recorded" in repr(worse)
     torque = dataclasses.replace(diagnosis.fit.loop, controller=jaxid.control.OpenLoop())
     driven = dataclasses.replace(diagnosis, fit=dataclasses.replace(diagnosis.fit, loop=torque))
     with pytest.raises(jaxid.errors.FitError, match="cannot follow a reference"):

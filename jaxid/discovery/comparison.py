@@ -242,15 +242,17 @@ def _simulate_in_windows(
     method: OEM, loop: ClosedLoop, recordings: Recordings, window: float | None
 ) -> tuple[Simulated, ...]:
     if window is None:
+        batch = prepare(loop, recordings)
         loop = with_substeps(loop, recordings)
-        batch = from_best_starts(method, loop, tuple(recordings), prepare(loop, recordings))
+        batch = from_best_starts(method, loop, tuple(recordings), batch)
         return by_recording(simulate_batch(loop, batch), recordings)
     runs = []
     for recording in recordings:
         # Windows keep the recording's name, because effects on named recordings need it.
         pieces = pieces_of(Recordings.of(recording), window)
+        batch = prepare(loop, pieces)
         stepped = with_substeps(loop, Recordings.of(recording))
-        parts = by_recording(simulate_batch(stepped, prepare(stepped, pieces)), pieces)
+        parts = by_recording(simulate_batch(stepped, batch), pieces)
         cut = [(0 if k == 0 else 1) for k in range(len(parts))]
         whole = {
             name: np.concatenate(

@@ -75,10 +75,16 @@ class Experiment(AbstractShown):
         return f"<p>{html.escape(repr(self))}</p>{table.to_html()}"
 
     def __repr__(self) -> str:
-        return (
+        said = (
             f"a reference of {self.recording.duration:.0f} s that distinguishes "
             f"{' and '.join(self.effects)} by {self.then:.3g} in whitened squared error; the "
             f"present recordings do by {self.now:.3g} (ten is decisive)"
+        )
+        if self.then > self.now:
+            return said
+        return (
+            f"{said}, so it is worth less than what is recorded: propose one with a longer "
+            "duration, wider limits or more tries"
         )
 
 

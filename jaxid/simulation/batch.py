@@ -15,7 +15,7 @@ from ..effects import recording_label
 from ..errors import RecordingError
 from ..recording import Recording, Recordings
 from ..signals.smoothing import Band, shared_length, signal_cutoff
-from .checks import check_joints
+from .checks import check_joints, check_law
 from .compared import compared_part
 from .integrals import Along, integral_states, integrals_at_start
 from .loop import ClosedLoop
@@ -247,6 +247,7 @@ def prepare(
     **Raises:** `RecordingError` if the joints do not match, `ModelError` from the controller.
     """
     check_joints(loop, recordings[0])
+    check_law(loop)
     if noise is not None:
         _check_noise(noise, recordings)
     period = loop.controller.period

@@ -15,7 +15,6 @@ from ..compiling import compiled
 from ..recording import Recording, Recordings
 from ..signals.standstill import Standstill
 from .batch import Batch, Interval, prepare
-from .checks import check_law
 from .dynamics import imposed
 from .integration import (
     initial,
@@ -300,7 +299,6 @@ def simulate(
     """
     recordings = Recordings.of(recordings)
     batch = prepare(loop, recordings, noise)
-    check_law(loop)
     return by_recording(simulate_batch(with_substeps(loop, recordings), batch), recordings)
 
 
