@@ -96,7 +96,8 @@ def _times(r: Recording) -> dict[str, Any]:
         "samples": r.samples,
         "Hz": r.rate,
         "s": r.duration,
-        "jitter ms": 1e3 * float(np.quantile(np.abs(steps - r.period), 0.9)),
+        # Rounding errors of times are no jitter.
+        "jitter ms": round(1e3 * float(np.quantile(np.abs(steps - r.period), 0.9)), 9),
         "gap ms": 1e3 * float(steps.max()),
         "gaps": int(missing_after(r.time).sum()),
         "q_ref": r.q_ref is not None,
@@ -247,27 +248,30 @@ def _notes_on_clocks(recordings: Recordings, joints: "pd.DataFrame") -> list[str
             origin = "digits of the file" if is_decimal(min(steps)) else "encoder counts"
             smallest.setdefault(f"{min(steps):.4g}, {origin}", []).append(j)
     for step, numbers in smallest.items():
-        notes.append(f"{_listed(numbers)} read in steps of {step}")
+        notes.append(f"{_listed(numbers)} {_are(numbers)} read in steps of {step}")
     for law, numbers in sorted(_joints_by_law(joints).items()):
         if law == "each":
             notes.append(
-                f"torque of {_listed(numbers)} computed from the recorded readings, as coherence "
+                f"the torque of {_listed(numbers)} is computed from the recorded readings, as coherence "
                 "shows: a law sampled at the log's rate or above, such as control.Sampled"
             )
         else:
             samples = int(law.removeprefix("every "))
             every = samples * recordings[0].period
             notes.append(
-                f"torque of {_listed(numbers)} held for {samples} samples: a law sampled every "
+                f"the torque of {_listed(numbers)} is held for {samples} samples: a law sampled every "
                 f"{1e3 * every:.4g} ms, such as control.Sampled(every={every:.4g})"
             )
     return notes
 
 
 def _listed(numbers: list[int]) -> str:
-    """Joints by number, with the verb that follows."""
-    several = len(numbers) > 1
-    return f"joint{'s' * several} {', '.join(map(str, numbers))} {'are' if several else 'is'}"
+    """Joints by number."""
+    return f"joint{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers))}"
+
+
+def _are(numbers: list[int]) -> str:
+    return "are" if len(numbers) > 1 else "is"
 
 
 def _joints_by_law(joints: "pd.DataFrame") -> dict[str, list[int]]:
