@@ -252,15 +252,15 @@ def _notes_on_clocks(recordings: Recordings, joints: "pd.DataFrame") -> list[str
     for law, numbers in sorted(_joints_by_law(joints).items()):
         if law == "each":
             notes.append(
-                f"the torque of {_listed(numbers)} is computed from the recorded readings, as coherence "
-                "shows: a law sampled at the log's rate or above, such as control.Sampled"
+                f"the torque of {_listed(numbers)} is computed from the recorded readings, as "
+                "coherence shows: a law sampled at the log's rate or above, such as control.Sampled"
             )
         else:
             samples = int(law.removeprefix("every "))
             every = samples * recordings[0].period
             notes.append(
-                f"the torque of {_listed(numbers)} is held for {samples} samples: a law sampled every "
-                f"{1e3 * every:.4g} ms, such as control.Sampled(every={every:.4g})"
+                f"the torque of {_listed(numbers)} is held for {samples} samples: a law sampled "
+                f"every {1e3 * every:.4g} ms, such as control.Sampled(every={every:.4g})"
             )
     return notes
 
