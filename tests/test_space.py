@@ -12,6 +12,7 @@ import jaxid
 from jaxid.arms import BODY, SerialArm
 from jaxid.chain import moved_body
 from jaxid.discovery.hypotheses import survey
+from jaxid.discovery.step import effect_parameters
 from jaxid.effects import (
     BaseTilt,
     CableDrag,
@@ -213,3 +214,13 @@ def test_each_arm_is_offered_the_gravity_and_the_payload_that_are_right_for_it()
     assert sorted([seen.x is None, seen.y is None]) == [False, True]
     weightless = jaxid.serial(turning, gravity=(0.0, 0.0, 0.0))
     assert not proposed(weightless)[BaseTilt]
+
+
+def test_values_of_a_payload_have_the_names_of_the_fit():
+    loop = jaxid.serial(POLAR)
+    body = CarriedBody(loop.arm.chain, 0.5, (0.1, 0.2), ("a",), (6, 7))
+    loop = loop.add(body)
+    found = effect_parameters(loop, loop.effects[-1])
+    names = [name for _, name, _ in found]
+    assert names == ["mass", *body.rest_names]
+    assert [loop.names[place] for place, _, _ in found][1:] == names[1:]

@@ -137,8 +137,9 @@ def effect_parameters(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[in
     for p in loop.free_parameters:
         steps = p.where.steps  # type: ignore[attr-defined]
         if steps[:2] == ("effects", position):
-            for k in range(p.size):
-                name = steps[-1] if not p.several else f"{steps[-1]}[{k + 1}]"
-                found.append((place + k, str(name), loop.unit(p)))
+            # Values with names of their own, such as those of a carried body, keep them.
+            numbered = [f"{steps[-1]}[{k + 1}]" if p.several else steps[-1] for k in range(p.size)]
+            names = p.labels or numbered
+            found += [(place + k, str(name), loop.unit(p)) for k, name in enumerate(names)]
         place += p.size
     return found
