@@ -4,9 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy
+from test_servo import WEIGHT, Pendulum
 
 import jaxid
 from jaxid.control import PD, PID, Sampled, Tracking
+from jaxid.effects import ActuatorLag
 from jaxid.errors import ModelError
 
 MASS, DRAG, EVERY = 2.0, 3.0, 0.005
@@ -20,7 +22,7 @@ def drive(delay=0, resolution=0.0, window=0, cutoff=None, limit=np.inf):
     system = np.array([[0.0, 1.0, 0.0], [0.0, -DRAG / MASS, 1 / MASS], [0.0, 0.0, 0.0]])
     step = scipy.linalg.expm(system * EVERY)
     slope = scipy.interpolate.CubicSpline(TIMES, REFERENCE)(TIMES, 1)
-    x, integral, waiting, past, slow = np.zeros(2), 0.0, [0.0] * delay, [0.0] * window, 0.0
+    x, integral, waiting, past, slow = np.zeros(2), 0.0, [], [0.0] * window, 0.0
     q, tau = [], []
     for ref, rate in zip(REFERENCE, slope, strict=True):
         read = resolution * np.round(x[0] / resolution) if resolution else x[0]
@@ -39,7 +41,8 @@ def drive(delay=0, resolution=0.0, window=0, cutoff=None, limit=np.inf):
         more = integral + EVERY * (ref - read)
         integral = integral if abs(law(more)) > limit else more
         command = float(np.clip(law(integral), -limit, limit))
-        waiting.append(command)
+        # The drive has run before: the commands that wait are the first one.
+        waiting = [*(waiting or [command] * delay), command]
         q.append(x[0])
         tau.append(command)
         x = (step @ [*x, waiting.pop(0)])[:2]
@@ -119,3 +122,22 @@ def test_fits_do_not_round_readings():
     )
     np.testing.assert_allclose(rounded, -30.0 * 0.012, rtol=1e-12)
     np.testing.assert_allclose(exact, -30.0 * 0.01234, rtol=1e-12)
+
+
+@pytest.mark.parametrize("effects", [(), (ActuatorLag(1, time_constant=5e-3),)])
+def test_a_law_has_run_before_the_first_sample(effects):
+    """An arm whose weight the law carries stays where it is, in spite of delay and lag."""
+    loop = jaxid.ClosedLoop(
+        arm=Pendulum(),
+        controller=Sampled(PD(Kp=2.0, Kv=0.05), every=2e-3, delay=3, velocity="difference"),
+        effects=effects,
+        name="pendulum",
+        stepping=jaxid.Stepping(substeps=8),
+    )
+    time = 0.01 * np.arange(100)
+    angle = np.full((100, 1), 0.4)
+    torque = WEIGHT * np.sin(0.4)
+    record = jaxid.Recording(time, angle, 0 * angle, q_ref=angle + torque / 2.0, v=0 * angle)
+    (run,) = jaxid.simulate(loop, record)
+    assert np.asarray(run.q) == pytest.approx(angle, abs=1e-9)
+    assert np.asarray(run.tau) == pytest.approx(np.full((100, 1), torque), abs=1e-8)

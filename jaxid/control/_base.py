@@ -68,6 +68,12 @@ class AbstractController(eqx.Module):
         """States of the law before the first tick; none by default."""
         return jnp.zeros(0)
 
+    def running(
+        self, reading: Reading, reference: Reference, state: Float[Array, " states"]
+    ) -> Float[Array, " states"]:
+        """The states at the start of a recording if the law ran before; unchanged by default."""
+        return state
+
     def derivative(
         self, reading: Reading, reference: Reference, state: Float[Array, " states"]
     ) -> Float[Array, " states"]:

@@ -95,6 +95,15 @@ class Sampled(AbstractController):
         slow = [] if self.cutoff is None else [reading.v]
         return jnp.concatenate([own, *[zero] * (1 + self.delay), *past, *slow])
 
+    def running(
+        self, reading: Reading, reference: Reference, state: Float[Array, " states"]
+    ) -> Float[Array, " states"]:
+        """The states with the first command instead of zero torque before it."""
+        n = reading.q.shape[0]
+        own, *rest = self._parts(state, n)
+        first = self.command(reading, reference, self.tick(reading, reference, state), jnp.eye(n))
+        return jnp.concatenate([own, *[first] * (1 + self.delay), *rest[1 + self.delay :]])
+
     def _parts(self, state: Float[Array, " states"], joints: int) -> list[Float[Array, " _"]]:
         """The law's states, then the other states by joint."""
         others = 1 + self.delay + self._past() + (self.cutoff is not None)

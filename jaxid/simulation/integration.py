@@ -34,7 +34,7 @@ from .dynamics import Instant, Outside, imposed, instant, reading
 from .exponential import Exponential
 from .loop import ClosedLoop
 from .pruning import pruned
-from .state import State, behind, rest, settle, unflatten
+from .state import State, behind, read, rest, settle, unflatten
 from .stepping import ready
 from .unrolling import unrolled
 
@@ -88,9 +88,11 @@ def initial(
     first = jax.tree.map(lambda leaf: leaf[0], intervals)
     reference = _reference(first, jnp.zeros(()))
     start = rest(loop, *behind(loop, q, v))
+    held = start.controller
     if first.integrals is not None:
-        held = start.controller + first.integrals
-        start = dataclasses.replace(start, controller=held)
+        held = held + first.integrals
+    held = loop.controller.running(read(loop, start.q, start.v), reference, held)
+    start = dataclasses.replace(start, controller=held)
     return ravel_pytree(settle(loop, first.t0, start, reference, first.label))[0]
 
 
