@@ -71,7 +71,10 @@ class AbstractController(eqx.Module):
     def running(
         self, reading: Reading, reference: Reference, state: Float[Array, " states"]
     ) -> Float[Array, " states"]:
-        """The states at the start of a recording if the law ran before; unchanged by default."""
+        """The states at the start of a recording, `(states,)`, if the law ran before.
+
+        `state` by default, which is the initial one with the integrals of the recording.
+        """
         return state
 
     def derivative(

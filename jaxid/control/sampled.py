@@ -98,7 +98,7 @@ class Sampled(AbstractController):
     def running(
         self, reading: Reading, reference: Reference, state: Float[Array, " states"]
     ) -> Float[Array, " states"]:
-        """The states with the first command instead of zero torque before it."""
+        """The states with the first command, N·m or N, in the place of zero torque before it."""
         n = reading.q.shape[0]
         own, *rest = self._parts(state, n)
         first = self.command(reading, reference, self.tick(reading, reference, state), jnp.eye(n))

@@ -260,8 +260,9 @@ def prepare(
         _drive(loop, r, g, length, e, held)
         for r, g, e in zip(recordings, grids, noises, strict=True)
     ]
-    if integral_states(loop).any():
-        rows = _with_integrals(loop, recordings, grids, rows)
+    own = integral_states(loop)
+    if own.any():
+        rows = _with_integrals(loop, own, recordings, grids, rows)
     fields = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
     # The structure is that of one interval; the values are already in place.
     one = Interval(*jax.device_put(jax.tree.map(lambda leaf: leaf[0, 0], fields)))
@@ -296,18 +297,20 @@ def prepare(
 
 def _with_integrals(
     loop: ClosedLoop,
+    own: Bool[np.ndarray, " states"],
     recordings: Recordings | Sequence[Recording],
     grids: Sequence[tuple[np.ndarray, np.ndarray]],
     rows: Sequence[tuple[Any, ...]],
 ) -> list[tuple[Any, ...]]:
-    """The fields of `_drive` with the states that the law's integrals have at the start."""
+    """The fields of `_drive` with the states that the law's integrals `own` have at the start."""
     along = []
     for recording, (grid, tick), row in zip(recordings, grids, rows, strict=True):
-        c0, c1, c2, _ = np.moveaxis(row[4][: len(grid)], 1, 0)
-        reference = np.stack([c0, c1, 2 * c2, row[5][: len(grid), 0]], axis=1)
-        held = {name: x[: len(grid)] for name, x in row[6].items()}
+        _, _, _, _, cubics, lines, signals, *_ = row
+        c0, c1, c2, _ = np.moveaxis(cubics[: len(grid)], 1, 0)
+        reference = np.stack([c0, c1, 2 * c2, lines[: len(grid), 0]], axis=1)
+        held = {name: x[: len(grid)] for name, x in signals.items()}
         along.append(Along.of(recording, grid, tick, reference, held))
-    states = integrals_at_start(loop, along)
+    states = integrals_at_start(loop, own, along)
     return [
         (*row, None, None, np.tile(state, (len(row[0]), 1)))
         for row, state in zip(rows, states, strict=True)

@@ -23,7 +23,10 @@ def check_joints(loop: ClosedLoop, recording: Recording) -> None:
 
 
 def check_law(loop: ClosedLoop) -> None:
-    """Raises `ModelError` for a law without one torque per joint, or whose states never change."""
+    """Raises `ModelError` for a law without one torque per joint, or with states of a wrong form.
+
+    States must be one vector, which `derivative` or `tick` changes.
+    """
     n, law = loop.joints, loop.controller
     changes = "derivative" if law.period is None else "tick"
 

@@ -26,9 +26,10 @@ _OTHER = 0.2
 class Along(eqx.Module):
     """The inputs of a law along one recording, at its grid points.
 
-    `tick` marks the ticks of a sampled law. `signals` are the position and velocity that it reads,
-    the reference's position, velocity and acceleration, and the known torque. `torque` is the
-    recorded one, NaN between samples.
+    `time` is in s. `tick` marks the ticks of a sampled law. `signals` are the position and velocity
+    that it reads, the reference's position, velocity and acceleration, rad or m and per s, and the
+    known torque, N·m or N. `held` are the signals of `Reference.held`. `torque` is the recorded
+    one, N·m or N, NaN between samples.
     """
 
     time: Float[Any, " points"]
@@ -89,7 +90,7 @@ def has_other_states(loop: ClosedLoop) -> bool:
 
 
 def integrals_at_start(
-    loop: ClosedLoop, recordings: Sequence[Along]
+    loop: ClosedLoop, own: Bool[np.ndarray, " states"], recordings: Sequence[Along]
 ) -> Float[np.ndarray, "recordings states"]:
     """States to add to the law's initial ones, so that its torque is the recorded one.
 
@@ -98,8 +99,11 @@ def integrals_at_start(
     in what they hold at the start; least squares over the first samples gives it. It is zero if it
     is not significant, or if the law does not give the recorded torque along the motion: then the
     law is wrong, or the torque is no recorded one.
+
+    **Arguments:**
+
+    - `own`: which states are integrals. `recordings`: the inputs of the law along each.
     """
-    own = integral_states(loop)
     points = min(_POINTS, *(len(r.time) for r in recordings))
     found = np.zeros((len(recordings), len(own)))
     for k, record in enumerate(recordings):
