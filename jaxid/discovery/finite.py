@@ -49,6 +49,10 @@ class OneOf(AbstractTransmission):
         """Torque that the chosen transmission transmits, N·m."""
         return self._of_chosen([option.through(twist, rate) for option in self.options], 0.0)
 
+    def twisted(self, torque: Float[Array, ""]) -> Float[Array, ""]:
+        """Twist at rest of the chosen transmission, rad."""
+        return self._of_chosen([option.twisted(torque) for option in self.options], 0.0)
+
     def _of_chosen(self, values: Sequence[Any], otherwise: float | bool) -> Any:
         found = jnp.asarray(otherwise)
         for k, value in enumerate(values):

@@ -14,7 +14,7 @@ from ..effects import AbstractTransmission, Motion
 from ..simulation.batch import Batch, Interval
 from ..simulation.compared import compared_table
 from ..simulation.dynamics import imposed
-from ..simulation.integration import SIGNALS, initial
+from ..simulation.integration import SIGNALS, initial, start_slopes
 from ..simulation.loads import link_load
 from ..simulation.loop import ClosedLoop
 from ..simulation.runs import advance, at_points, each, run
@@ -33,16 +33,16 @@ class Linearised(eqx.Module):
     of `places` at both ends of an interval: torque on the drives (`push`), additions to the
     positions (`noise`) and velocities (`rate`) that the sensors read, and torque on the links
     (`pull`) if transmissions or load-dependent friction separate them from the drives. Each leaf
-    has `(recordings, points)` first. `direct` is true along an imposed motion, where torques change
-    no state. `motion` is the nominal motion, `seen` the signals of
-    `SIGNALS`.
+    has `(recordings, points)` first. `start` contains the derivatives of the first state by the free
+    parameters, the position and the velocity. `direct` is true along an imposed motion, where
+    torques change no state. `motion` is the nominal motion, `seen` the signals of `SIGNALS`.
     """
 
     A: Float[Array, "recordings points states states"]
     B: Float[Any, "recordings points states inputs"]
     C: Float[Array, "recordings points outputs states"]
     D: Float[Any, "recordings points outputs inputs"]
-    start: Float[Array, "recordings states starts"]
+    start: Float[Any, "recordings states starts"]
     motion: Motion
     seen: Float[Array, "recordings points 5 joints"]
     places: tuple[Place, ...] = eqx.field(static=True)
@@ -68,9 +68,13 @@ def linearise(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
 
     def along(one: Batch) -> Linearised:
         found = _linearised(wide, one, output)
-        inputs = np.append(own, np.arange(others, found.B.shape[-1]))
-        B, D = (np.asarray(x)[..., inputs] for x in (found.B, found.D))
-        return dataclasses.replace(found, B=B, D=D)
+
+        def of_loop(slopes: Any) -> Float[np.ndarray, "..."]:
+            inputs = np.append(own, np.arange(others, slopes.shape[-1]))
+            return np.asarray(slopes)[..., inputs]
+
+        B, D, start = of_loop(found.B), of_loop(found.D), of_loop(found.start)
+        return dataclasses.replace(found, B=B, D=D, start=start)
 
     linear = one_by_one(along, batch)
     torques = [linear.inputs(place) for place in ("push", "pull") if place in linear.places]
@@ -106,9 +110,7 @@ def _linearised(loop: ClosedLoop, batch: Batch, output: str) -> Linearised:
         # The signals are those of `at`, so that the equations are compiled only once.
         states, _, _ = run(loop, intervals, x0)
         a, b, c, d, seen = at_points(many, at, intervals, states)
-        start = jax.jacfwd(lambda z: initial(loop, intervals, z[:n], z[n:]))(
-            jnp.concatenate([q0, v0])
-        )
+        start = start_slopes(loop, intervals, q0, v0)
         still = jnp.zeros((states.shape[0], 0))
         motion = jax.vmap(Motion)(
             intervals.t0,
@@ -146,9 +148,7 @@ def _base_columns(
 ) -> Float[Array, "recordings points outputs columns"]:
 
     def one(a, b, c, d, start):
-        first = jnp.zeros((a.shape[-1], parameters))
-        if free_start:
-            first = jnp.concatenate([first, start], axis=1)
+        first = start if free_start else start[:, :parameters]
         extra = first.shape[1] - parameters
 
         def body(s, step):
@@ -211,7 +211,8 @@ def _response(
         s = jnp.zeros((a.shape[-1], values.shape[-1]), values.dtype)
         if place in ("noise", "rate"):
             # A run starts at the position and velocity that the sensors read.
-            of = start[:, :joints] if place == "noise" else start[:, joints:]
+            first = start.shape[-1] - joints * (2 if place == "noise" else 1)
+            of = start[:, first : first + joints]
             s = -times(of.astype(values.dtype), values[0])
         matrices = (x.astype(values.dtype) for x in (a, b[..., inputs], c, d[..., inputs]))
         return jax.lax.scan(body, (s, values[0]), (*matrices, after))[1]

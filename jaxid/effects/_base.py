@@ -198,6 +198,14 @@ class AbstractTransmission(AbstractEffect):
         """No twist, at rest."""
         return jnp.zeros(2)
 
+    def settled(self, motion: Motion) -> Float[Array, " states"]:
+        """The twist under the torque `motion.tau` that holds the links, at rest."""
+        return jnp.stack([self.twisted(motion.tau[self.joint - 1]), jnp.zeros(())])
+
+    def twisted(self, torque: Float[Array, ""]) -> Float[Array, ""]:
+        """Twist at rest at which it transmits this torque (N·m or N); zero if it is not known."""
+        return jnp.zeros_like(torque)
+
     def after(self, other: "AbstractTransmission", load: float) -> "AbstractTransmission | None":
         """The effect at values similar to another fitted transmission; None if there are none.
 

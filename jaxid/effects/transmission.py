@@ -12,6 +12,9 @@ from ..parameters import Scalar, parameter
 from ._base import AbstractTransmission
 from ._scene import Scene
 
+# Twist of a contact, as a share of the gap, from which on a torque closes the gap.
+_LOADED = 1e-3
+
 
 class JointElasticity(AbstractTransmission):
     """A compliant transmission: torque (drive - link) / compliance, slightly damped (Spong 1987).
@@ -58,6 +61,10 @@ class JointElasticity(AbstractTransmission):
         """Transmitted torque, N·m."""
         soft = jnp.where(self.compliance > 0, self.compliance, 1.0)
         return -(twist + self.damping * rate) / soft
+
+    def twisted(self, torque: Float[Array, ""]) -> Float[Array, ""]:
+        """Twist at rest, rad."""
+        return -self.compliance * torque
 
 
 class Backlash(AbstractTransmission):
@@ -116,3 +123,8 @@ class Backlash(AbstractTransmission):
         side = jnp.sign(twist)
         grip = jnp.maximum(1 + self.damping * side * rate, 0.0)
         return -side * self.stiffness * depth * grip
+
+    def twisted(self, torque: Float[Array, ""]) -> Float[Array, ""]:
+        """Twist at rest, rad; in the middle of the gap if there is hardly any torque."""
+        loaded = jnp.abs(torque) > _LOADED * self.stiffness * self.gap
+        return jnp.where(loaded, -jnp.sign(torque) * self.gap / 2 - torque / self.stiffness, 0.0)

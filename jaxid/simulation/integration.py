@@ -96,6 +96,21 @@ def initial(
     return ravel_pytree(settle(loop, first.t0, start, reference, first.label))[0]
 
 
+def start_slopes(
+    loop: ClosedLoop,
+    intervals: Interval,
+    q: Float[Array, " joints"],
+    v: Float[Array, " joints"],
+) -> Float[Array, "states starts"]:
+    """Derivative of `initial` by the free parameters, the position and the velocity."""
+    n, p = loop.joints, loop.theta.shape[0]
+
+    def begin(z: Float[Array, " starts"]) -> Float[Array, " states"]:
+        return initial(loop.with_theta(z[:p]), intervals, z[p : p + n], z[p + n :])
+
+    return jax.jacfwd(begin)(jnp.concatenate([loop.theta, q, v]))
+
+
 def observe(
     loop: ClosedLoop, interval: Interval, x: Float[Array, " states"], rows: tuple[int, ...]
 ) -> tuple[Float[Array, " states"], Float[Array, "rows joints"]]:

@@ -11,7 +11,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from ..control import Reading, Reference
-from ..effects import AbstractEffect, Motion
+from ..effects import AbstractEffect, AbstractTransmission, Motion
+from .loads import link_load
 from .loop import ClosedLoop
 
 
@@ -37,20 +38,40 @@ def settle(
     reference: Reference,
     label: Int[Array, ""],
 ) -> State:
-    """The state with the effects' own states in equilibrium at the first command."""
+    """The state with the effects' own states in equilibrium.
+
+    Those of drives are at the first command, transmissions at the torque that holds the links.
+    """
     seen = read(loop, state.q, state.v)
     mass = loop.arm.mass_matrix(state.q)
     tau = loop.controller.command(seen, reference, state.controller, mass)
     still, none = jnp.zeros_like(state.q), jnp.zeros(0)
     motion = Motion(t, state.q, state.v, still, tau, none, label, reference.held)
-    settled = []
+    held, settled = motion, []
+    if any(isinstance(effect, AbstractTransmission) for effect in loop.effects):
+        held = dataclasses.replace(motion, tau=_held(loop, motion, state.effects))
     for effect in loop.effects:
-        own = effect.settled(motion)
+        own = effect.settled(held if isinstance(effect, AbstractTransmission) else motion)
         settled.append(own)
         motion = dataclasses.replace(
             motion, tau=effect.command(dataclasses.replace(motion, state=own))
         )
     return dataclasses.replace(state, effects=tuple(settled))
+
+
+def _held(
+    loop: ClosedLoop, motion: Motion, states: tuple[Float[Array, " _"], ...]
+) -> Float[Array, " joints"]:
+    """Torque through transmissions that holds the links at rest, `(joints,)`, N·m or N.
+
+    A drive that gives less does not hold them: then it is the command. The command of a law that
+    imposes the motion is not that of the drives.
+    """
+    still = dataclasses.replace(motion, v=jnp.zeros_like(motion.v))
+    needed = link_load(loop, still, states)
+    if loop.controller.imposes:
+        return needed
+    return jnp.clip(motion.tau, jnp.minimum(needed, 0.0), jnp.maximum(needed, 0.0))
 
 
 def _sensor(loop: ClosedLoop, q: Float[Array, " joints"]) -> Float[Array, " joints"]:

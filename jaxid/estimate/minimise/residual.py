@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ...compiling import compiled
 from ...linear_algebra import column_basis
 from ...simulation.batch import Batch
-from ...simulation.integration import SIGNALS, initial
+from ...simulation.integration import SIGNALS, initial, start_slopes
 from ...simulation.loop import ClosedLoop
 from ...simulation.runs import each, run, run_with_sensitivities
 from .filtering import filtered_by, known_rows
@@ -83,15 +83,11 @@ def beginning(
 
     Columns are the loop's parameters and, if estimated, the initial position and velocity.
     """
-    p, n = loop.theta.shape[0], loop.joints
+    columns = loop.theta.shape[0] + (2 * loop.joints if free_start else 0)
 
     def one(intervals, q0, v0):
-        by_start = jax.jacfwd(lambda z: initial(loop, intervals, z[:n], z[n:]))(
-            jnp.concatenate([q0, v0])
-        )
-        x = initial(loop, intervals, q0, v0)
-        extra = 2 * n if free_start else 0
-        return x, jnp.concatenate([jnp.zeros((x.shape[0], p)), by_start[:, :extra]], axis=1)
+        slopes = start_slopes(loop, intervals, q0, v0)
+        return initial(loop, intervals, q0, v0), slopes[:, :columns]
 
     return each(one, batch.intervals, batch.q0, batch.v0)
 
