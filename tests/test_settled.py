@@ -34,6 +34,7 @@ def reference(t):
 
 def recorded(kind, held=True, end=6.0):
     """A drive and a link that starts in equilibrium, or without twist."""
+
     def law(t, q, v):
         return KP * (reference(t) - q) - KD * v
 

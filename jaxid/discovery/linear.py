@@ -33,7 +33,7 @@ class Linearised(eqx.Module):
     of `places` at both ends of an interval: torque on the drives (`push`), additions to the
     positions (`noise`) and velocities (`rate`) that the sensors read, and torque on the links
     (`pull`) if transmissions or load-dependent friction separate them from the drives. Each leaf
-    has `(recordings, points)` first. `start` contains the derivatives of the first state by the free
+    has `(recordings, points)` first, except `start`, the derivatives of the first state by the free
     parameters, the position and the velocity. `direct` is true along an imposed motion, where
     torques change no state. `motion` is the nominal motion, `seen` the signals of `SIGNALS`.
     """
