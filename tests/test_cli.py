@@ -199,6 +199,24 @@ def test_annotations_of_ones_own_robot_may_be_strings(tmp_path):
     assert "MX2" in load_robot(f"{file}:loop").names
 
 
+def test_the_bodies_of_a_urdf_are_estimated_if_asked(tmp_path):
+    file = tmp_path / "slide.urdf"
+    inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    file.write_text(
+        f'<robot name="one"><link name="a"/><link name="b"><inertial><mass value="2"/>{inertia}'
+        '</inertial></link><joint name="j" type="prismatic"><parent link="a"/><child link="b"/>'
+        '<axis xyz="0 0 1"/><limit lower="0" upper="1" effort="9" velocity="1"/></joint></robot>'
+    )
+    drawn, near, free = (load_robot(f"{file}{end}") for end in ("", ":near", ":free"))
+    assert not any(p.declaration.symbol == "base" for p in drawn.free_parameters)
+    for loop in (near, free):
+        assert any(p.declaration.symbol == "base" for p in loop.free_parameters)
+    assert near.arm.covariance is not None
+    assert free.arm.covariance is None
+    with pytest.raises(ModelError, match="bodies is 'far': give 'drawn', 'near' or 'free'"):
+        load_robot(f"{file}:far")
+
+
 def test_windows_are_refused_where_nothing_is_simulated():
     result = run("fit", FIT_1, *SCARA, "--method", "idim", "--window", "1")
     assert result.exit_code == 2

@@ -16,8 +16,9 @@ def load_robot(robot: str | None) -> Any:
 
     **Arguments:**
 
-    - `robot`: `scara`, `two-link`, `emps`, a URDF file, or `path/to/file.py:name` of a loop, or of
-      a function without arguments that returns one; None if the user gave none.
+    - `robot`: `scara`, `two-link`, `emps`, a URDF file, if wanted with `:near` or `:free` as the
+      `bodies` of `jaxid.serial`, or `path/to/file.py:name` of a loop, or of a function without
+      arguments that returns one; None if the user gave none.
 
     **Raises:** `ModelError` if there is no such robot or its file cannot be used.
     """
@@ -32,9 +33,11 @@ def load_robot(robot: str | None) -> Any:
         )
     if robot in ready:
         return ready[robot]()
+    path, _, name = robot.rpartition(":")
     if robot.lower().endswith(".urdf"):
         return robots.serial(robot)
-    path, _, name = robot.rpartition(":")
+    if path.lower().endswith(".urdf"):
+        return robots.serial(path, bodies=name)
     if robot.endswith(".py"):
         names = _named(_module(robot), ClosedLoop) or "NAME"
         raise ModelError(f"{robot} is named without its loop: give --robot {robot}:{names}")
