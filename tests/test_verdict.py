@@ -92,12 +92,23 @@ def test_what_held_out_recordings_say_of_an_effect_is_told(found):
     assert story.to_dict()["added"][0]["held_out"] == "raises"
 
 
+def test_an_undecided_search_tells_what_its_best_model_gains_on_held_out_recordings(found):
+    start, last = found.steps[0], found.steps[-1]
+    story = dataclasses.replace(found, verdict="undetermined", reason="a test fails")
+    before, after = (s.held_out.error_percent.to_numpy()[0, 1] for s in (start, last))
+    gain = f"from {before:.3g} to {after:.3g} %, but a test fails."
+    assert f" and lowers the error of joint 2 on held-out recordings {gain}" in story.sentence
+    without = tuple(dataclasses.replace(s, held_out=None) for s in found.steps)
+    for steps in ((last, last), without):
+        assert "lowers the error" not in dataclasses.replace(story, steps=steps).sentence
+
+
 def test_no_probability_is_given_if_no_examined_model_passes_the_tests(found):
     step = dataclasses.replace(found.steps[-1], probability=None)
     story = dataclasses.replace(
         found, verdict="undetermined", reason="a test fails", steps=(found.steps[0], step)
     )
-    assert "the best model adds torque offset on joint 2, but a test fails." in story.sentence
+    assert "the best model adds torque offset on joint 2 and lowers" in story.sentence
     text = " ".join(repr(story).split())
     assert "torque_offset on joint 2 (confirmed by held-out recordings): level" in text
     assert "no probabilities are given" in text

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from ..effects import AbstractEffect
 from ..errors import ModelError
 from ..estimate import Fit
+from ..estimate.result import joint_columns
 from ..simulation.loop import ClosedLoop
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
@@ -99,6 +100,24 @@ def _placed(name: str, effect: AbstractEffect) -> str:
 def joint_errors(table: "pd.DataFrame") -> Float[np.ndarray, " joints"]:
     """Errors by joint, %, over the recordings of a table of errors."""
     return over_recordings(table.to_numpy())
+
+
+def gained(steps: Sequence[Step]) -> str:
+    """Where added effects lower the error on held-out recordings by half or more, in words.
+
+    It names the joint on which they lower it most; empty if there is none, or no such recording.
+    """
+    first, last = steps[0].held_out, steps[-1].held_out
+    if first is None or last is None:
+        return ""
+    before, after = joint_errors(first.error_percent), joint_errors(last.error_percent)
+    j = int(np.argmax(np.where(after < before / 2, before - after, 0.0)))
+    if not after[j] < before[j] / 2:
+        return ""
+    return (
+        f"lowers the error of {joint_columns(len(before))[j]} on held-out recordings from "
+        f"{before[j]:.3g} to {after[j]:.3g} %"
+    )
 
 
 def errors_of(step: Step) -> dict[str, list[float]]:

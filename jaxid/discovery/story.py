@@ -28,7 +28,16 @@ from .floor import SPOKEN
 from .hypotheses import effect_on
 from .landscape import form
 from .models import Model, models_table, named, picked
-from .step import Step, added_in_words, errors_of, found_parameters, joint_errors, odds, step_name
+from .step import (
+    Step,
+    added_in_words,
+    errors_of,
+    found_parameters,
+    gained,
+    joint_errors,
+    odds,
+    step_name,
+)
 from .text import WIDTH, capitalised, errors_table, in_brackets, joined, models_lines, wrapped
 from .undecided import probability_of_start
 from .verdict import Outcome
@@ -110,7 +119,8 @@ class Discovery(AbstractShown):
         if self.unfinished and not added:
             return f"The model of {self.loop.name} lacks an effect, but none was to be added."
         if self.verdict == "undetermined":
-            best = f"the best model adds {added}, but " if added else ""
+            doing = " and ".join(x for x in (f"adds {added}", gained(self.steps)) if x)
+            best = f"the best model {doing}, but " if added else ""
             return (
                 f"These recordings do not tell what the model of {self.loop.name} lacks: "
                 f"{best}{self.reason}."
@@ -237,14 +247,9 @@ class Discovery(AbstractShown):
         from ..display import figures
 
         series = {"fitted": np.stack([joint_errors(s.fit.error_percent) for s in self.steps])}
-        if all(s.held_out is not None for s in self.steps):
-            series["held out"] = np.stack(
-                [
-                    joint_errors(s.held_out.error_percent)
-                    for s in self.steps
-                    if s.held_out is not None
-                ]
-            )
+        unseen = [s.held_out for s in self.steps if s.held_out is not None]
+        if len(unseen) == len(self.steps):
+            series["held out"] = np.stack([joint_errors(x.error_percent) for x in unseen])
         labels = [step.label for step in self.steps]
         return figures.error_falling(labels, series, self.noise_floor_percent())
 
