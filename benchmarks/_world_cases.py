@@ -240,13 +240,13 @@ def _noise(rng: np.random.Generator, shape: tuple[int, ...], kind: str) -> np.nd
     return white
 
 
-def unexplained(signals: dict[str, np.ndarray], law: str) -> np.ndarray:
+def unexplained(signals: dict[str, np.ndarray], *, along_motion: bool) -> np.ndarray:
     """The part of a recorded torque that no model explains, `(samples, joints)`, N·m or N.
 
-    Without the law, a model has the torque along the recorded motion, and not its aliases. A
-    simulation of the law has both.
+    Models that give the torque along the recorded motion do not give its aliases. A simulation of
+    the law gives both.
     """
-    return signals["noise"] + (signals["aliased"] if law == "unknown" else 0.0)
+    return signals["noise"] + (signals["aliased"] if along_motion else 0.0)
 
 
 def start_model(case: Case, law: str) -> jaxid.ClosedLoop:

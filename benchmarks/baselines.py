@@ -48,7 +48,8 @@ def run_case(wanted: Wanted, seed: int, tools: Sequence[str]) -> dict[str, Any]:
         with tempfile.TemporaryDirectory() as folder:
             fitting, held_out = read_case(Path(folder), case)
         loop = start_model(case, LAW)
-        floor = floor_percent(loop, unexplained(case.recordings["held_out"], LAW), held_out)
+        noise = unexplained(case.recordings["held_out"], along_motion=True)
+        floor = floor_percent(loop, noise, held_out)
         started = time.process_time()
         table = table_of(case.drawn, fitting)
         prepared = time.process_time() - started
@@ -133,7 +134,8 @@ def visible(case: Case, table: Table) -> list[float]:
             wave = np.zeros_like(motion.q)
             wave[:, effect.joint] = torques[name]
             own = np.concatenate([own, motion.thinned(wave)])
-            noise = np.concatenate([noise, motion.thinned(unexplained(case.recordings[name], LAW))])
+            rest = unexplained(case.recordings[name], along_motion=True)
+            noise = np.concatenate([noise, motion.thinned(rest)])
         here = table.joint == effect.joint
         left = residual(table.base, table.rows(own))[here]
         found.append(float(np.linalg.norm(left) / np.linalg.norm(table.rows(noise)[here])))

@@ -67,7 +67,8 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
     found = jaxid.discover(start, fitting, validate=held_out, progress=False)
     took = {"took": time.perf_counter() - started, "cpu": time.process_time() - cpu}
     story = found.to_dict()
-    noise = unexplained(case.recordings["held_out"], wanted.law)
+    signals, along = case.recordings["held_out"], found.loop.controller.imposes
+    noise = unexplained(signals, along_motion=along)
     floor = floor_percent(found.loop, noise, held_out)
     return {
         "truth": [
