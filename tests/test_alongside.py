@@ -15,11 +15,11 @@ from stories import recordings_of, silent
 import jaxid
 from jaxid import Stepping
 from jaxid.control import PD, OpenLoop, Sampled, Tracking
-from jaxid.discovery import alongside
-from jaxid.discovery.alongside import along_recorded, delays_of_drives, in_the_loop
+from jaxid.discovery import alongside, started
+from jaxid.discovery.alongside import along_recorded, delays_of_drives, in_the_loop, late_drives
 from jaxid.discovery.ranking import judge
 from jaxid.discovery.screening import screen
-from jaxid.effects import JointElasticity, Stribeck, TorqueOffset
+from jaxid.effects import JointElasticity, Stribeck, TimeDelay, TorqueOffset
 
 LAW = PD(Kp=[800.0, 600.0, 3000.0, 90.0], Kv=[80.0, 60.0, 300.0, 9.0])
 
@@ -65,6 +65,32 @@ def test_a_search_continues_along_the_recorded_motion_after_the_first_fit(subste
     # Effects are not sure if the law contradicts the torque.
     assert (found.verdict == "undetermined") == ("the law" in why)
     assert any("in the simulated loop the error" in note for note in found.notes)
+
+
+def test_a_search_that_has_made_all_drives_late_begins_again_without_the_law(monkeypatch, tmp_path):
+    # As if other effects explained what the delays leave in the first fit.
+    monkeypatch.setattr(started, "sampled", lambda *_: "")
+    law = sim.SampledPD(period=0.01)
+    fit, held_out = recordings_of(sim.make_case(5, effects=[OFFSET], duration=8.0, controller=law))
+    given = {"catalogue": [TorqueOffset, TimeDelay], "progress": False, "resume": tmp_path}
+    found = jaxid.discover(jaxid.scara(), fit, held_out, **given)
+    assert [s.label for s in found.steps] == ["start", "+ torque_offset on joint 1"]
+    assert all(isinstance(s.fit.loop.controller, Tracking) for s in found.steps)
+    assert "time_delay" not in "".join(m.label for m in found.considered)
+    assert any("like a law that is sampled" in note for note in found.notes)
+    again = jaxid.discover(jaxid.scara(), fit, held_out, **given)
+    np.testing.assert_array_equal(again.fit.theta, found.fit.theta)
+
+
+@pytest.mark.parametrize(
+    ("delays", "sampled"),
+    [((1e-3, 1.2e-3), True), ((1e-3, 2.5e-3), False), ((1e-3,), False), ((9e-3, 9e-3), False)],
+)
+def test_drives_that_are_late_alike_are_a_sampled_law(delays, sampled):
+    late = [TimeDelay(joint=j, delay=delay) for j, delay in enumerate(delays, start=1)]
+    said = late_drives(scara(), [TorqueOffset(joint=1), *late], period=2e-3)
+    assert ("like a law that is sampled" in said) == sampled
+    assert late_drives(jaxid.serial(four_joints()), late, period=2e-3) == ""
 
 
 def test_drives_are_late_under_a_sampled_law():

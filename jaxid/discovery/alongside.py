@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..control import Tracking
-from ..effects import AbstractTransmission, ActuatorLag, TimeDelay
+from ..effects import AbstractEffect, AbstractTransmission, ActuatorLag, TimeDelay
 from ..errors import FitError, ModelError
 from ..estimate import Fit, Status
 from ..recording import Recordings
@@ -25,8 +25,8 @@ from .separate import columns_of, select
 
 # Largest delay of a torque in samples that a sampled law explains.
 LATE = 2.0
-# Smallest significant delay, in standard deviations.
-_SURE = 3.0
+# Smallest significant delay, in standard deviations, and largest ratio of delays with one cause.
+_SURE, _ALIKE = 3.0, 2.0
 # Effects that are the same as the delay of a drive, or approximate it.
 _LAGS = (TimeDelay, ActuatorLag, AbstractTransmission)
 # Steps between two grid points up to which a simulation is fast enough.
@@ -69,7 +69,33 @@ def sampled(diagnosis: Diagnosis, screened: Screened) -> str:
 
     - `diagnosis`: of a fit under a continuous law. `screened`: its linear system and hypotheses.
     """
-    late = delays_of_drives(diagnosis, screened)
+    return _as_sampled(delays_of_drives(diagnosis, screened))
+
+
+def late_drives(given: ClosedLoop, effects: Sequence[AbstractEffect], period: float) -> str:
+    """Why the search goes on without the law if it has made all drives late; empty if it has not.
+
+    Drives that are late by about the same time have a common cause: the law is sampled.
+
+    **Arguments:**
+
+    - `given`: the starting model. `effects`: those that the search has added. `period`: of the
+      samples, s.
+    """
+    late: dict[int, float] = {}
+    for effect in effects:
+        if isinstance(effect, TimeDelay | ActuatorLag):
+            delay = effect.delay if isinstance(effect, TimeDelay) else effect.time_constant
+            late[effect.joint] = late.get(effect.joint, 0.0) + float(delay)
+    times = tuple(late.values())
+    if not _may_be_sampled(given) or len(times) < given.joints:
+        return ""
+    alike = max(times) < _ALIKE * min(times) and max(times) < LATE * period
+    return _as_sampled(times) if alike else ""
+
+
+def _as_sampled(late: Sequence[float]) -> str:
+    """Why the search goes on without the law if its drives have these delays, s."""
     if not late:
         return ""
     return (
@@ -99,8 +125,7 @@ def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, .
     **Arguments:** those of `sampled`.
     """
     loop, period = screened.system.loop, diagnosis.fit.recordings.common_period()
-    law = loop.controller
-    if loop.joints < 2 or law.period is not None or law.imposes or law.judged != "torque":
+    if not _may_be_sampled(loop):
         return ()
     data = dataclasses.replace(screened.data, level=diagnosis.data.level)
     predictor = Predictor.of(screened.system, diagnosis.noise, data.level)
@@ -122,6 +147,13 @@ def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, .
     found, std = _beside(late, strong_directions(others.astype(float)))
     sure = np.all((found > _SURE * std) & (std > 0) & (found < LATE * period))
     return tuple(found.tolist()) if sure else ()
+
+
+def _may_be_sampled(loop: ClosedLoop) -> bool:
+    """Whether delays of all drives would show that a law declared as continuous is sampled."""
+    law = loop.controller
+    simulated = law.period is None and not law.imposes and law.judged == "torque"
+    return simulated and loop.joints > 1
 
 
 def _beside(

@@ -50,6 +50,11 @@ class Examined:
         self.offsets: dict[str, AbstractEffect] = {}
         self.diagnoses: dict[tuple, Diagnosis] = {}
 
+    def forget(self) -> None:
+        """Forgets all models and notes, except the diagnosis of the starting model."""
+        self.visited, self.small, self.offsets, self.failures = Visited(), set(), {}, ()
+        self.diagnoses = {key: found for key, found in self.diagnoses.items() if not key}
+
     def note(self, said: str) -> None:
         """Stores a note for the result, once."""
         self.failures = tuple(dict.fromkeys((*self.failures, said)))

@@ -29,6 +29,10 @@ class Fits:
     def __init__(self, refits: Refits, campaign: Campaign, prefix: str = "") -> None:
         self._refits, self._campaign, self._prefix = refits, campaign, prefix
 
+    def renamed(self, prefix: str) -> "Fits":
+        """The same for further fits whose names begin with another prefix, too."""
+        return Fits(self._refits, self._campaign, f"{self._prefix}{prefix}")
+
     def start(self, loop: ClosedLoop, name: str = "start") -> Fit:
         """The fit of the starting model.
 

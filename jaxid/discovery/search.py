@@ -7,27 +7,21 @@ from itertools import islice
 
 import numpy as np
 
-from ..effects import AbstractEffect
 from ..errors import FitError, ModelError
-from ..estimate import Fit
-from ..estimate.mistakes import doubtful_law
 from ..noise import ARFilter
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
-from .alongside import sampled, slow_or_wrong, without_law
-from .diagnosis import Diagnosis, over_recordings, share_left
-from .examined import Examined
+from .diagnosis import over_recordings, share_left
 from .explore import DECISIVE, Candidate, explore, key_of, largest_first
-from .landscape import Landscape, forms_of
+from .landscape import Landscape
 from .last_tries import doubtful, replaced, with_transmission, without_offset
 from .likelihood import price
 from .loose import undetermined, with_fewer, without_loose
 from .models import LIKELY, Model, Named, listed
 from .predict import Predictor
-from .ranking import Screened, judge
 from .release import released
 from .relevance import loses, matches_curve, matters
-from .screening import carried, screen
+from .started import Started
 from .support import unsupported
 from .system import System
 from .verdict import Outcome
@@ -44,20 +38,14 @@ _EXAMINED = 12
 _AHEAD = 2
 
 
-class Search(Examined):
+class Search(Started):
     """A search, with the examined models and the current one.
 
     **Arguments:** those of `Examined`.
     """
 
-    # Why the law is doubtful; empty if it is not.
-    refuted: str = ""
-    # Why the search went on along the recorded motion after the first fit; empty if it did not.
-    why: str = ""
     # Effects that were added and later removed.
     removed: tuple[Named, ...] = ()
-    # Linear system and diagnosis of the current fit, until a prediction has used them.
-    latest: tuple[Screened, Diagnosis] | None = None
     # Sets of the last prediction of which an effect does not explain stretches that were left out.
     without_support: frozenset[tuple] = frozenset()
     # Those of which a fit determines no value of an effect, or finds values of another effect.
@@ -69,8 +57,7 @@ class Search(Examined):
         **Returns:** the verdict before the tests of the final model, and whether `most` stopped the
         search although a better set was predicted.
         """
-        self.given = loop
-        at = self._start(loop)
+        at = self.start(loop)
         assert at.fit is not None
         if at.fit.mistake:
             self.at = at
@@ -88,12 +75,14 @@ class Search(Examined):
             if better is None:
                 break
             at = better
+            if (again := self.restarted(at)) is not None:
+                at, self.removed = again, ()
         self.at = at
         outcome = self._verdict(candidates, nothing)
         if self.at.key not in self.diagnoses:
             # A model of an earlier round, from which the search did not continue.
             assert self.at.fit is not None
-            self._screened(self.at.fit, self.at.effects)
+            self.screened(self.at.fit, self.at.effects)
         return outcome
 
     def stopped(self) -> bool:
@@ -103,59 +92,11 @@ class Search(Examined):
             self.at = fitted[0]
         return bool(fitted)
 
-    def _start(self, loop: ClosedLoop) -> Model:
-        """The starting model, fitted with noise filters."""
-        self.watched.begin("fit", "fit of the starting model")
-        first = self.fits.start(loop)
-        self.refuted = doubtful_law(first)
-        first = self._along(first, slow_or_wrong(first, self.refuted))
-        screened, diagnosis = self._screened(first, ())
-        again = self._along(first, "" if first.mistake else sampled(diagnosis, screened))
-        if again is not first:
-            first, self.forms = again, 0
-            screened, diagnosis = self._screened(first, ())
-        if first.mistake:
-            # Effects would only approximate the mistake.
-            return self.visit((), first)
-        # If noise is strongly coloured, plain output error is imprecise. A filter that is estimated
-        # from the residual itself would model a missing effect as noise, so that of the diagnosis
-        # is used.
-        self.watched.begin("fit", "fit of the starting model with noise filters")
-        again = self.fits.start_filtered(first, diagnosis.noise)
-        again = dataclasses.replace(again, notes=(*first.notes, *again.notes))
-        fit = again if again.succeeded else first
-        if fit is first:
-            self.latest = screened, diagnosis
-        else:
-            self.latest = self._screened(fit, (), carried(screened, first, fit))
-        return self.visit((), fit)
-
-    def _along(self, first: Fit, why: str) -> Fit:
-        """The fit of the starting model along the recorded motion if there is a reason for it."""
-        along = without_law(first.loop)
-        if not why or along is first.loop:
-            return first
-        self.why = f"{why} sets of effects are compared along the recorded motion, without the law"
-        self.note(self.why)
-        self.given = dataclasses.replace(self.given, controller=along.controller)
-        return self.fits.start(self.given, "start along the recorded motion")
-
-    def _screened(
-        self, fit: Fit, effects: Sequence[AbstractEffect], known: Screened | None = None
-    ) -> tuple[Screened, Diagnosis]:
-        """The linear system at a fit with its signatures, and the diagnosis, which is stored."""
-        self.watched.begin("screen", "where the model fails")
-        screened = known or screen(fit, self.asked.catalogue, self.watched.say)
-        diagnosis = judge(fit, screened, self.asked.significance)
-        self.forms = max(self.forms, forms_of(screened.hypotheses))
-        self.diagnoses[key_of(effects)] = diagnosis.light()
-        return screened, diagnosis
-
     def _predicted(self, at: Model) -> tuple[list[Candidate], float]:
         """Sets of additional effects, best first, and the score of the empty set."""
         assert at.fit is not None
         # The tables are large, so only those of the starting model are stored.
-        screened, diagnosis = self.latest or self._screened(at.fit, at.effects)
+        screened, diagnosis = self.latest or self.screened(at.fit, at.effects)
         self.latest = None
         data = dataclasses.replace(screened.data, level=diagnosis.data.level)
         landscape = Landscape.of(screened.system, data, screened.hypotheses, diagnosis.noise)
