@@ -24,6 +24,7 @@ import numpy as np
 import pandas as pd
 
 import jaxid
+from jaxid.errors import JaxidError
 
 from ._output import show, write
 from ._world_cases import Case, draw_wanted, make, read_case, start_model
@@ -122,7 +123,7 @@ def run_case(seed: int, number: int, name: str, bodies: str) -> dict[str, Any]:
         story = jaxid.discover(loop, fitting, held_out, progress=False)
         verdict, said = story.verdict, f"{story.sentence} {' '.join(story.notes)}"
         left = float(story.fit.error_percent.to_numpy().max())
-    except jaxid.JaxidError as error:
+    except JaxidError as error:
         verdict, said, left = "refused", str(error), np.nan
     return {
         "mistake": name,

@@ -285,6 +285,27 @@ def slid(seed: int, units: tuple[float, float]) -> jaxid.Recording:
     return jaxid.Recording.from_arrays(time, q * units, tau, name=f"run{seed}")
 
 
+SCARA = """<robot name="scara"><link name="base"/><link name="upper"><inertial>
+<mass value="2.0"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="lower"><inertial><origin xyz="{centre} 0 0"/>
+<mass value="2.0"/><inertia ixx="1" iyy="1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+<axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="900" velocity="9"/></joint>
+<joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/>
+<origin xyz="0.8 0 0"/><axis xyz="0 0 1"/>
+<limit lower="-3" upper="3" effort="900" velocity="9"/></joint></robot>"""
+
+
+@pytest.mark.parametrize(("centre", "is_named"), [(0.08, True), (0.0, False)])
+def test_another_robot_contradicts_the_small_torque_that_only_the_drawn_one_has(centre, is_named):
+    """A gantry is an arm of which no body is off its axis; then nothing shows that it is none."""
+    runs = [slid(seed, (1.0, 1.0)) for seed in (1, 2)]
+    drawn = jaxid.serial(SCARA.format(centre=centre), bodies="free")
+    found = jaxid.fit(drawn, runs, jaxid.OEM(progress=False))
+    assert found.error_percent.to_numpy().max() < 4
+    assert ("that the file describes this robot" in found.mistake) == is_named
+
+
 @pytest.mark.parametrize(("unit", "is_named"), [(1.0, False), (180 / np.pi, True)])
 def test_one_joint_in_a_wrong_unit_contradicts_the_drawn_bodies(unit, is_named):
     """The mass of the cart alone moves the second joint, so it absorbs the unit."""

@@ -119,8 +119,9 @@ def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, .
 
     The delays are estimated together in the linear system. Any missing effect leaves a residual
     that delays explain in part, so they compete with the effects and curves of the catalogue and
-    are estimated beside those that are selected with them. A single drive that is late is an
-    effect. With one joint the two are the same.
+    are estimated beside those that explain more. (Those that explain less may be substitutes for a
+    part of the delays.) A single drive that is late is an effect. With one joint the two are the
+    same.
 
     **Arguments:** those of `sampled`.
     """
@@ -143,7 +144,7 @@ def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, .
     chosen = select(white, [*blocks, range(known, known + len(drives))])
     if own not in chosen:
         return ()
-    others = white.signatures[:, columns_of(blocks, [k for k in chosen if k != own])]
+    others = white.signatures[:, columns_of(blocks, chosen[: chosen.index(own)])]
     found, std = _beside(late, strong_directions(others.astype(float)))
     sure = np.all((found > _SURE * std) & (std > 0) & (found < LATE * period))
     return tuple(found.tolist()) if sure else ()

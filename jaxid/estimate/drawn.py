@@ -24,8 +24,9 @@ from .result import Fit
 _LIGHT = 0.5
 # The same for one joint: an angle in degrees has 1/57 of the inertia, a distance in mm 1/1000.
 _UNIT = 1 / 20
-# Smallest torque of drawn bodies that is compared, as a share of the recorded torque.
-_VISIBLE = 0.1
+# Smallest torque of drawn bodies that is compared, as a share of the recorded torque; a smaller
+# part is compared if it is this multiple of the fit's error, which may be similar to it by chance.
+_VISIBLE, _CLEAR = 0.1, 4.0
 # Smallest significant difference, in standard deviations.
 _SURE = 3.0
 _OTHERWISE = "if the file is wrong instead, start from the estimated bodies (jaxid.write_urdf)"
@@ -128,10 +129,12 @@ def _torques(found: Fit, bodies: _Bodies) -> Float[np.ndarray, " joints"] | None
     own = np.repeat([p.place == ("arm", "base") for p in chosen], [p.size for p in chosen])
     drawn, estimated = np.asarray(bodies.drawn.base), np.asarray(bodies.arm.base)
     share, high = np.full((2, bodies.arm.joints), np.nan)
+    left = np.sqrt(np.mean(found.error_percent.to_numpy() ** 2, axis=0)) / 100
     for j in range(bodies.arm.joints):
         mine = stacked.columns[:, j][:, own]
         size = float(np.linalg.norm(rows["tau"][:, j]))
-        weight = _weight(mine @ drawn, mine @ estimated, rows["a"][:, j], size)
+        least = min(_VISIBLE, _CLEAR * left[j]) * size
+        weight = _weight(mine @ drawn, mine @ estimated, rows["a"][:, j], least)
         if weight is not None:
             slope = weight @ mine
             share[j] = slope @ estimated
@@ -144,7 +147,7 @@ def _weight(
     expected: Float[np.ndarray, " samples"],
     estimated: Float[np.ndarray, " samples"],
     a: Float[np.ndarray, " samples"],
-    size: float,
+    least: float,
 ) -> Float[np.ndarray, " samples"] | None:
     """Weights of samples, 1/(N·m) or 1/N, for the coefficient of the expected torque in another.
 
@@ -153,12 +156,12 @@ def _weight(
     **Arguments:**
 
     - `expected`, `estimated`: torque of drawn and of estimated bodies on a joint, N·m or N.
-    - `a`: its acceleration, rad/s² or m/s². `size`: norm of its recorded torque, N·m or N.
+    - `a`: its acceleration, rad/s² or m/s². `least`: smallest norm of expected torque, N·m or N.
     """
     for others in (np.stack([a, np.ones_like(a)], axis=1), np.ones((len(a), 1))):
         basis = np.linalg.qr(others)[0]
         rest = expected - basis @ (basis.T @ expected)
-        if not np.linalg.norm(rest) > _VISIBLE * size:
+        if not np.linalg.norm(rest) > least:
             return None
         weight = rest / (rest @ rest)
         left = estimated - (weight @ estimated) * expected
