@@ -12,7 +12,7 @@ from ..parameters import Scalar, parameter
 from ._base import AbstractTransmission
 from ._scene import Scene
 
-# Twist of a contact, as a share of the gap, from which on a torque closes the gap.
+# Smallest twist of the contact, as a share of the gap, of a torque that closes the gap.
 _LOADED = 1e-3
 
 
