@@ -286,9 +286,9 @@ def test_worlds_tell_what_a_logger_aliases():
     np.testing.assert_allclose(seen["aliased"][middle, 0], expected, atol=1e-4)
     line = np.abs(np.fft.rfft(seen["aliased"][middle, 0]))
     assert np.fft.rfftfreq(len(expected), 1 / 250)[np.argmax(line)] == pytest.approx(55, abs=0.1)
-    left = seen["tau"] - motion[::4, None] - unexplained(seen, "unknown")
+    left = seen["tau"] - motion[::4, None] - unexplained(seen, along_motion=True)
     assert abs(left[middle]).max() < 1e-4
-    np.testing.assert_array_equal(unexplained(seen, "sampled"), seen["noise"])
+    np.testing.assert_array_equal(unexplained(seen, along_motion=False), seen["noise"])
 
 
 def test_a_world_whose_effect_does_not_act_is_drawn_again():
