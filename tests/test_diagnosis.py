@@ -62,6 +62,19 @@ def test_results_show_themselves(bump_story):
     assert "position of joint 2" in bump_story._repr_html_()
 
 
+@pytest.mark.xdist_group("bump")
+def test_samples_that_are_not_compared_are_not_drawn(bump_story):
+    diagnosis = bump_story.first_diagnosis
+    residual = diagnosis.data.residual.copy()
+    residual[:, ::2] = 0.0
+    left_out = dataclasses.replace(
+        diagnosis, data=dataclasses.replace(diagnosis.data, residual=residual)
+    )
+    (drawn,) = (t for t in left_out.plot_where().data if t.name == "residual of joint 2")
+    assert len(drawn.y) > 100
+    assert not np.any(np.asarray(drawn.y) == 0)
+
+
 def test_effective_tests_are_honest():
     """Of tests that are one and the same there is one; of independent ones, their number."""
     rng = np.random.default_rng(0)

@@ -7,15 +7,16 @@ import pytest
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 NAMES = sorted(path.name for path in NOTEBOOKS.glob("*.ipynb"))
-EMPS = Path(__file__).parents[2] / "shared" / "data" / "emps"
+DATA = Path(__file__).parents[2] / "shared" / "data"
+EMPS, KR300 = DATA / "emps", DATA / "kr300"
 
 FEWER = {"seed in range(40)": "seed in range(6)", "draws=200": "draws=20"}
 
 nbformat = pytest.importorskip("nbformat", reason="the extra `notebook` is not installed")
 
 
-def test_there_are_six() -> None:
-    assert [name[:2] for name in NAMES] == [f"{k}_" for k in range(1, 7)]
+def test_there_are_seven() -> None:
+    assert [name[:2] for name in NAMES] == [f"{k}_" for k in range(1, 8)]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -41,6 +42,9 @@ def test_it_runs(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ipykernel", reason="the extra `notebook` is not installed")
     if EMPS.is_dir():
         monkeypatch.setenv("EMPS", str(EMPS))
+    if "measured_arm" in name and not KR300.is_dir():
+        pytest.skip("no ../shared/data/kr300 beside the checkout")
+    monkeypatch.setenv("KR300", str(KR300))
     # Figures as data: no browser draws them.
     monkeypatch.setenv("PLOTLY_RENDERER", "plotly_mimetype")
     root = str(NOTEBOOKS.parent)

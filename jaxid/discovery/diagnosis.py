@@ -288,9 +288,12 @@ class Diagnosis(AbstractShown):
         joint, motion = curve.joint, self.motion
         along = motion.t if curve.coordinate == "t" else getattr(motion, curve.coordinate)
         along = np.asarray(along if curve.coordinate == "t" else along[..., curve.of - 1])
-        x, y = self._kept(along), self._kept(self.data.residual[..., joint - 1])
+        residual = self.data.residual[..., joint - 1]
+        # It is zero while the joint is at rest, if its standstill is left out.
+        there = self.data.mask & (residual != 0)
+        x, y = along[there], residual[there]
         if curve.signed:
-            y = y * np.sign(self._kept(np.asarray(motion.v)[..., joint - 1]))
+            y = y * np.sign(np.asarray(motion.v)[..., joint - 1][there])
         torque, position = self.fit.loop.arm.units()
         return figures.dependence(
             x,
@@ -311,10 +314,6 @@ class Diagnosis(AbstractShown):
         **Raises:** `SaveError` if it cannot be written.
         """
         return save(self, path)
-
-    def _kept(self, rows: Float[np.ndarray, "recordings points"]) -> Float[np.ndarray, " samples"]:
-        """The samples of all recordings, one after the other."""
-        return rows[self.data.mask]
 
     def to_dict(self) -> dict[str, Any]:
         """The ranking and where the model fails, as plain JSON."""
