@@ -24,9 +24,11 @@ from .result import Fit
 _LIGHT = 0.5
 # The same for one joint: an angle in degrees has 1/57 of the inertia, a distance in mm 1/1000.
 _UNIT = 1 / 20
-# Smallest torque of drawn bodies that is compared, as a share of the recorded torque; a smaller
-# part is compared if it is this multiple of the fit's error, which may be similar to it by chance.
-_VISIBLE, _CLEAR = 0.1, 4.0
+# Smallest torque of drawn bodies that is compared, as a share of the recorded torque.
+_VISIBLE = 0.1
+# A smaller torque is compared if it is this multiple of the fit's error, which may be similar to it
+# by chance. It is often a difference of larger ones, so hardly anything of it may be there.
+_CLEAR, _GONE = 4.0, 0.2
 # Smallest significant difference, in standard deviations.
 _SURE = 3.0
 _OTHERWISE = "if the file is wrong instead, start from the estimated bodies (jaxid.write_urdf)"
@@ -128,7 +130,7 @@ def _torques(found: Fit, bodies: _Bodies) -> Float[np.ndarray, " joints"] | None
     chosen = linear_parameters(found.loop)
     own = np.repeat([p.place == ("arm", "base") for p in chosen], [p.size for p in chosen])
     drawn, estimated = np.asarray(bodies.drawn.base), np.asarray(bodies.arm.base)
-    share, high = np.full((2, bodies.arm.joints), np.nan)
+    share, high, limit = np.full((3, bodies.arm.joints), np.nan)
     left = np.sqrt(np.mean(found.error_percent.to_numpy() ** 2, axis=0)) / 100
     for j in range(bodies.arm.joints):
         mine = stacked.columns[:, j][:, own]
@@ -139,8 +141,9 @@ def _torques(found: Fit, bodies: _Bodies) -> Float[np.ndarray, " joints"] | None
             slope = weight @ mine
             share[j] = slope @ estimated
             high[j] = share[j] + _SURE * np.sqrt(slope @ bodies.covariance @ slope)
+            limit[j] = _LIGHT if 1 / np.linalg.norm(weight) > _VISIBLE * size else _GONE
     tested = np.isfinite(share)
-    return share[tested] if tested.any() and np.all(high[tested] < _LIGHT) else None
+    return share[tested] if tested.any() and np.all((high < limit)[tested]) else None
 
 
 def _weight(
