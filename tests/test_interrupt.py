@@ -43,4 +43,4 @@ def test_after_the_fit_of_an_effect_it_is_in_the_model(monkeypatch, offset_case,
 
 def test_before_the_first_fit_there_is_nothing(monkeypatch, offset_case, tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        interrupted_at(monkeypatch, offset_case, tmp_path / "new", "_start")
+        interrupted_at(monkeypatch, offset_case, tmp_path / "new", "start")
