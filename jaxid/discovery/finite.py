@@ -50,7 +50,7 @@ class OneOf(AbstractTransmission):
         return self._of_chosen([option.through(twist, rate) for option in self.options], 0.0)
 
     def twisted(self, torque: Float[Array, ""]) -> Float[Array, ""]:
-        """Twist at rest of the chosen transmission, rad."""
+        """Twist at rest of the chosen transmission with this torque (N·m or N), rad."""
         return self._of_chosen([option.twisted(torque) for option in self.options], 0.0)
 
     def _of_chosen(self, values: Sequence[Any], otherwise: float | bool) -> Any:

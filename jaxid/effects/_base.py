@@ -199,11 +199,11 @@ class AbstractTransmission(AbstractEffect):
         return jnp.zeros(2)
 
     def settled(self, motion: Motion) -> Float[Array, " states"]:
-        """The twist under the torque `motion.tau` that holds the links, at rest."""
+        """The twist under the torque `motion.tau` that holds the links, and no rate, `(2,)`."""
         return jnp.stack([self.twisted(motion.tau[self.joint - 1]), jnp.zeros(())])
 
     def twisted(self, torque: Float[Array, ""]) -> Float[Array, ""]:
-        """Twist at rest at which it transmits this torque (N·m or N); zero if it is not known."""
+        """Twist at rest (rad or m) with this torque (N·m or N); zero if it is not known."""
         return jnp.zeros_like(torque)
 
     def after(self, other: "AbstractTransmission", load: float) -> "AbstractTransmission | None":

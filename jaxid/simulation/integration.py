@@ -102,7 +102,10 @@ def start_slopes(
     q: Float[Array, " joints"],
     v: Float[Array, " joints"],
 ) -> Float[Array, "states starts"]:
-    """Derivative of `initial` by the free parameters, the position and the velocity."""
+    """Derivative of `initial` by the free parameters, the position and the velocity.
+
+    The columns are in this order, `(states, parameters + 2 joints)`.
+    """
     n, p = loop.joints, loop.theta.shape[0]
 
     def begin(z: Float[Array, " starts"]) -> Float[Array, " states"]:
