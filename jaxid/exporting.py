@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float
 
-from .arms import SerialArm
+from .arms import AbstractSerialArm
 from .arms.urdf import parsed_urdf, read_urdf
 from .chain import moved_body
 from .effects import AbstractEffect, CarriedBody, Coulomb, Viscous
@@ -42,7 +42,7 @@ def write_urdf(
 
     **Arguments:**
 
-    - `loop`: of a `SerialArm`, fitted.
+    - `loop`: of an arm that was read from a URDF, fitted.
     - `source`: the URDF that the arm was read from, path or text. `path`: where to write.
     - `bodies`: as `physical_bodies` returns them, `(joints, 10)`; the loop's own if None.
     - `base`, `tip`: as given to `SerialArm.from_urdf`.
@@ -100,7 +100,7 @@ def write_mjcf(
 
     **Arguments:**
 
-    - `loop`: of a `SerialArm`, fitted. `path`: where to write.
+    - `loop`: of an arm that was read from a URDF, fitted. `path`: where to write.
     - `bodies`: as `physical_bodies` returns them, `(joints, 10)`; the loop's own if None.
 
     **Raises:** `ModelError` for another arm, or bodies that MuJoCo would refuse.
@@ -196,11 +196,11 @@ def _warn_of_the_rest(
         )
 
 
-def _serial(loop: ClosedLoop) -> SerialArm:
-    if not isinstance(loop.arm, SerialArm):
+def _serial(loop: ClosedLoop) -> AbstractSerialArm:
+    if not isinstance(loop.arm, AbstractSerialArm):
         raise ModelError(
             f"{loop.name} is a {type(loop.arm).__name__}, which has no links in space: only arms "
-            "of SerialArm.from_urdf can be written"
+            "that were read from a URDF (jaxid.serial) can be written"
         )
     return loop.arm
 

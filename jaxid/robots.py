@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .arms import SCARA, Axis, SerialArm, TwoLink, drawn_covariance
+from .arms import SCARA, Axis, PhysicalArm, SerialArm, TwoLink, drawn_covariance
 from .arms.urdf import read_urdf
 from .control import PD, AbstractController, Cascade, Tracking
 from .effects import Coulomb, RotorInertia, TorqueOffset, Viscous
@@ -85,20 +85,26 @@ def serial(
     - `gears`: turns of each motor per turn of each joint, `(joints, joints)`, if motors drive more
       than their own joint.
     - `bodies`: `"drawn"` to hold the links' bodies at the values of the file, `"free"` to estimate
-      their base parameters, `"near"` to estimate them as far as the recordings contradict the
-      values of the file.
+      their base parameters, `"near"` to estimate these as far as the recordings contradict the
+      values of the file, `"physical"` to deform the bodies of the file as far as the recordings
+      contradict them, so that all links are physically consistent (`jaxid.arms.PhysicalArm`).
     - `uncertainty`: relative standard deviation of masses and inertias in the file, for `"near"`
-      (`jaxid.arms.drawn_covariance`). Regressions (`IDIM`, `DIDIM`) ignore it.
+      (`jaxid.arms.drawn_covariance`) and `"physical"`. Regressions (`IDIM`, `DIDIM`) ignore it,
+      and hold bodies that are deformed.
     - `base`, `tip`, `gravity`: as for `SerialArm.from_urdf`.
 
     **Raises:** `ModelError` for a file that describes no serial arm.
     """
-    if bodies not in ("drawn", "free", "near"):
-        raise ModelError(f"bodies is {bodies!r}: give 'drawn', 'near' or 'free'")
+    if bodies not in ("drawn", "free", "near", "physical"):
+        raise ModelError(f"bodies is {bodies!r}: give 'drawn', 'near', 'physical' or 'free'")
     if not uncertainty > 0:
         raise ModelError(f"uncertainty is {uncertainty}: give a positive number, such as 0.2")
     found = read_urdf(source, base, tip)
-    arm = SerialArm.of(found, gravity, gears)
+    if bodies == "physical":
+        deformed = PhysicalArm.of(found, gravity, gears)
+        arm = dataclasses.replace(deformed, uncertainty=uncertainty)
+    else:
+        arm = SerialArm.of(found, gravity, gears)
     n = arm.joints
     if rotors is not None and len(rotors) != n:
         raise ModelError(f"rotors are given for {len(rotors)} of {n} joints: give one for each")
@@ -108,18 +114,18 @@ def serial(
         *(TorqueOffset(joint=j) for j in range(1, n + 1)),
         *(RotorInertia(joint=j, inertia=float(own[j - 1])) for j in range(1, n + 1)),
     )
-    loop = ClosedLoop(arm, controller or Tracking(), effects, name=found.name)
-    held = [p.name for p in loop.parameters if p.declaration.symbol == "base"]
-    if bodies != "drawn":
+    held = [] if rotors is None else [f"Ia{j}" for j in range(1, n + 1)]
+    if isinstance(arm, SerialArm) and bodies == "drawn":
+        held += ["base"]
+    elif isinstance(arm, SerialArm):
         # The inertias of the first rotor and of some others are parts of base parameters.
         inside = [j for j, within in enumerate(arm.absorbed_rotors(), start=1) if within]
         held = [f"Ia{j}" for j in inside]
         if bodies == "near":
             unknown = inside if rotors is None else []
             known = drawn_covariance(arm, uncertainty, unknown)
-            loop = dataclasses.replace(loop, arm=dataclasses.replace(arm, covariance=known))
-    elif rotors is not None:
-        held += [f"Ia{j}" for j in range(1, n + 1)]
+            arm = dataclasses.replace(arm, covariance=known)
+    loop = ClosedLoop(arm, controller or Tracking(), effects, name=found.name)
     # The smoothing of friction near standstill is unknown; it matters most for motions with rests.
     smoothings = [p.name for p in loop.parameters if p.declaration.symbol == "eps"]
     return loop.hold(*held).free(*smoothings)

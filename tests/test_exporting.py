@@ -131,7 +131,7 @@ def test_a_small_probability_of_physical_bodies_is_rare(tmp_path):
 
 def test_only_arms_in_space_are_written_and_only_to_their_own_urdf(described, tmp_path):
     path, tip = described
-    with pytest.raises(ModelError, match="only arms of SerialArm"):
+    with pytest.raises(ModelError, match="only arms that were read from a URDF"):
         jaxid.write_urdf(jaxid.scara(), path, tmp_path / "out.urdf", tip=tip)
     one = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
       <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>

@@ -173,7 +173,7 @@ def test_values_that_only_the_drawing_tells_are_named(fitted):
     assert np.all(ratio < 1.001)
     named = [n for n, x in zip(fitted.names[:count], ratio, strict=True) if x > 0.7]
     assert named
-    assert said.startswith(f"{len(named)} of {count} base parameters")
+    assert said.startswith(f"{len(named)} of {count} parameters of the links")
     assert said.endswith(", ".join(named))
 
 
@@ -220,7 +220,10 @@ def test_an_offset_that_the_motion_shows_is_not_drawn_to_zero():
 
 @pytest.mark.parametrize(
     ("given", "said"),
-    [({"bodies": "close"}, "'drawn', 'near' or 'free'"), ({"uncertainty": 0.0}, "positive number")],
+    [
+        ({"bodies": "close"}, "'drawn', 'near', 'physical' or 'free'"),
+        ({"uncertainty": 0.0}, "positive number"),
+    ],
 )
 def test_what_cannot_be_is_refused(given, said):
     with pytest.raises(ModelError, match=said):

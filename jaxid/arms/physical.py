@@ -124,7 +124,7 @@ def _physical(cvxpy, arm: SerialArm):
     """Unknowns in units of `_scales`, the bodies, and the constraints that they are physical."""
     unknown = cvxpy.Variable(10 * arm.joints)
     matter = [
-        _pseudo_inertia(cvxpy, unknown[10 * k : 10 * (k + 1)]) >> _LEAST * np.eye(4)
+        pseudo_inertia(cvxpy, unknown[10 * k : 10 * (k + 1)]) >> _LEAST * np.eye(4)
         for k in range(arm.joints)
     ]
     return unknown, cvxpy.multiply(_scales(arm).ravel(), unknown), matter
@@ -150,10 +150,10 @@ def _distances(
 
 def smallest_eigenvalues(bodies: Float[np.ndarray, "joints 10"]) -> Float[np.ndarray, " joints"]:
     """Smallest eigenvalue of each body's pseudo-inertia; above zero if the body is physical."""
-    return np.array([np.linalg.eigvalsh(_pseudo_inertia(np, body))[0] for body in bodies])
+    return np.array([np.linalg.eigvalsh(pseudo_inertia(np, body))[0] for body in bodies])
 
 
-def _pseudo_inertia(library, body):
+def pseudo_inertia(library, body):
     """The 4 by 4 matrix of a body's second and first moments and its mass."""
     xx, xy, xz, yy, yz, zz, mx, my, mz, m = (body[k] for k in range(10))
     rows = [

@@ -15,8 +15,8 @@ Files = Annotated[
 Robot = Annotated[
     str | None,
     typer.Option(
-        help="FILE.urdf (FILE.urdf:near or FILE.urdf:free also estimates its bodies), FILE.py:NAME "
-        "of a loop of your own, scara, two-link or emps; required."
+        help="FILE.urdf (FILE.urdf:near, :physical or :free also estimates its bodies), "
+        "FILE.py:NAME of a loop of your own, scara, two-link or emps; required."
     ),
 ]
 Json = Annotated[Path | None, typer.Option("--json", help="Also write the result here.")]

@@ -21,7 +21,7 @@ from ..simulation.sharing import with_one_blas_thread
 from .drawn import contradiction
 from .mistakes import LARGE_PERCENT, at_limit, doubtful_law, likely_mistake
 from .oem import OEM, oem_of
-from .prior import drawing_note
+from .prior import drawing_notes
 from .result import DOUBTFUL_PERCENT, AbstractMethod, Fit, Status
 from .standstill import raised, slow_note
 
@@ -72,7 +72,7 @@ def fit(
             break
         found = again
     found = _followed(_doubted(_examined(_without_nan(found), loop)))
-    notes = (*found.notes, *_matter(found), *drawing_note(found), *_band(loop, recordings))
+    notes = (*found.notes, *_matter(found), *drawing_notes(found), *_band(loop, recordings))
     notes = (*notes, *slow_note(given, found.loop), *_gaps(recordings))
     notes = (*notes, *_begun(loop, recordings))
     return dataclasses.replace(found, notes=notes)

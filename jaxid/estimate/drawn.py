@@ -12,9 +12,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..arms import SerialArm
+from ..arms import AbstractSerialArm, PhysicalArm, SerialArm, in_base_parameters
 from ..effects import RotorInertia
 from ..errors import JaxidError
+from ..parameters import list_parameters, read_values
 from ..simulation.inertia import mass_matrices
 from .idim import stack_with_motion
 from .regression import linear_parameters
@@ -75,15 +76,18 @@ def _listed(values: Float[np.ndarray, " joints"]) -> str:
 
 
 def _bodies_of(found: Fit) -> _Bodies | None:
-    """The bodies of a fit; None if it has not estimated all of their base parameters."""
+    """The bodies of a fit; None if it has not estimated all of their parameters."""
     arm = found.loop.arm
-    if not isinstance(arm, SerialArm) or not found.succeeded:
+    if not isinstance(arm, AbstractSerialArm) or not found.succeeded:
         return None
-    names = [n for p in found.loop.free_parameters if p.place == ("arm", "base") for n in p.names]
+    names = [n for p in found.loop.free_parameters if p.place[0] == "arm" for n in p.names]
     at = [found.names.index(name) for name in names]
     covariance = found.covariance[np.ix_(at, at)]
-    if len(at) < len(arm.base) or not np.isfinite(covariance).all():
+    if len(at) < len(read_values(arm, list_parameters(arm))) or not np.isfinite(covariance).all():
         return None
+    if isinstance(arm, PhysicalArm):
+        arm, covariance = in_base_parameters(arm, covariance)
+    assert isinstance(arm, SerialArm)
     return _Bodies(arm, dataclasses.replace(arm, base=None), covariance)
 
 
@@ -124,10 +128,11 @@ def _torques(found: Fit, bodies: _Bodies) -> Float[np.ndarray, " joints"] | None
     drawn torque apart from these two is small are left out.
     """
     try:
-        stacked, rows = stack_with_motion(found.loop, found.recordings)
+        loop = dataclasses.replace(found.loop, arm=bodies.arm)
+        stacked, rows = stack_with_motion(loop, found.recordings)
     except JaxidError:
         return None
-    chosen = linear_parameters(found.loop)
+    chosen = linear_parameters(loop)
     own = np.repeat([p.place == ("arm", "base") for p in chosen], [p.size for p in chosen])
     drawn, estimated = np.asarray(bodies.drawn.base), np.asarray(bodies.arm.base)
     share, high, limit = np.full((3, bodies.arm.joints), np.nan)
