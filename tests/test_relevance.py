@@ -27,15 +27,23 @@ def left(joint: float) -> np.ndarray:
     ],
 )
 def test_effects_that_explain_as_much_as_a_curve_are_no_approximation(effects, curve, expected):
-    assert matches_curve(BEFORE, left(effects), left(curve), FLOOR) is expected
+    assert matches_curve(BEFORE, left(effects), left(curve), FLOOR, 2) is expected
 
 
 def test_only_the_joint_of_the_curve_counts():
     other = np.array([0.1, 2.4])
-    assert not matches_curve(BEFORE, other, left(0.5), FLOOR)
+    assert not matches_curve(BEFORE, other, left(0.5), FLOOR, 2)
+
+
+def test_a_larger_change_on_another_joint_is_not_compared():
+    """Bodies that are estimated anew change the error of another joint by more than the curve's."""
+    before, effects, curve = np.array([3.4, 1.7]), np.array([2.93, 0.82]), np.array([2.92, 0.78])
+    floor = np.array([2.85, 0.78])
+    assert matches_curve(before, effects, curve, floor, 2)
+    assert not matches_curve(before, effects, curve, floor, 1)
 
 
 def test_errors_that_are_not_known_show_nothing():
-    assert not matches_curve(None, left(0.5), left(0.5), FLOOR)
-    assert not matches_curve(BEFORE, None, left(0.5), FLOOR)
-    assert not matches_curve(BEFORE, left(0.5), None, FLOOR)
+    assert not matches_curve(None, left(0.5), left(0.5), FLOOR, 2)
+    assert not matches_curve(BEFORE, None, left(0.5), FLOOR, 2)
+    assert not matches_curve(BEFORE, left(0.5), None, FLOOR, 2)

@@ -70,10 +70,10 @@ def without_loose(search: Examined, at: Model) -> Model | None:
     if not loose or not rivals:
         return None
     part, floor = search.part(at, rivals[0].effects), search.diagnoses[at.key].floor_percent()
-    if not matches_curve(part.left, rivals[0].left, at.left, floor):
-        return None
     curve = rivals[0].curve
     assert curve is not None
+    if not matches_curve(part.left, rivals[0].left, at.left, floor, curve.joint):
+        return None
     said = f"{listed(loose)}: no value is determined; a curve of {curve.label} explains as much"
     search.note(said)
     return part

@@ -62,21 +62,25 @@ def matches_curve(
     effects: Float[np.ndarray, " joints"] | None,
     curve: Float[np.ndarray, " joints"] | None,
     floor: Float[np.ndarray, " joints"],
+    joint: int,
 ) -> bool:
     """Whether effects explain most of the residual of the joint of a curve.
 
     Then they are not mere approximations of the curve, although it may have a better score. If the
     noise is low, the score compares what is left after both, which can be due to filters, ticks
-    and stiction.
+    and stiction. The errors of other joints also change, but less directly.
 
-    **Arguments:** relative errors by joint, %, before, with the effects and with the curve, and
-    that of noise.
+    **Arguments:**
+
+    - `before`, `effects`, `curve`: relative errors by joint, %, before, with the effects and with
+      the curve. `floor`: that of noise.
+    - `joint`: of the curve, from 1.
     """
     if before is None or effects is None or curve is None:
         return False
-    joint = int(np.argmax(before**2 - curve**2))
     explained = before**2 - np.minimum(curve, floor) ** 2
-    return bool(before[joint] ** 2 - effects[joint] ** 2 >= _AS_MUCH * explained[joint])
+    own = joint - 1
+    return bool(before[own] ** 2 - effects[own] ** 2 >= _AS_MUCH * explained[own])
 
 
 def loses(less: Model, at: Model, worth: float) -> bool:

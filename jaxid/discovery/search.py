@@ -171,6 +171,7 @@ class Search(Started):
         gain = nothing - (np.inf if curve is None else curve.score)
         limit = at.score - max(gain - max(DECISIVE, _INEXACT * gain), LIKELY)
         by_curve = None if curve is None else self._left_by(curve)
+        joint = 1 if curve is None or curve.curve is None else curve.curve.joint
         floor = self.diagnoses[at.key].floor_percent()
         better = [
             pair
@@ -178,7 +179,7 @@ class Search(Started):
             if pair[0].score < limit
             or (
                 pair[0].score < at.score - LIKELY
-                and matches_curve(at.left, pair[0].left, by_curve, floor)
+                and matches_curve(at.left, pair[0].left, by_curve, floor, joint)
             )
         ]
         best = min(better, key=lambda pair: pair[0].score, default=None)
@@ -319,7 +320,9 @@ class Search(Started):
         if rivals and rivals[0].score < self.at.score - DECISIVE:
             part = self.part(self.at, rivals[0].effects)
             floor = self.diagnoses[self.at.key].floor_percent()
-            if not matches_curve(part.left, self.at.left, rivals[0].left, floor):
+            curve = rivals[0].curve
+            assert curve is not None
+            if not matches_curve(part.left, self.at.left, rivals[0].left, floor, curve.joint):
                 self.at = part
                 return "outside_catalogue", False
         # Sets whose effects have no determined value only approximate a curve.
