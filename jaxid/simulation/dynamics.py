@@ -10,9 +10,12 @@ from jaxtyping import Array, Float, Int
 from ..arms import AbstractArm
 from ..control import Reading, Reference
 from ..effects import AbstractEffect, AbstractTransmission, DriveGain, Motion
-from .loads import effect_loads
+from .loads import effect_loads, turns
 from .loop import ClosedLoop
 from .state import State, behind, read
+
+# Number of Newton steps for friction that depends on acceleration, linearly between few kinks.
+_KINKS = 3
 
 
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -282,10 +285,42 @@ def _accelerations(
     ]
     if transmissions:
         return _through_transmissions(loop, motion, state, transmissions, outside, added)
+    if any(e.loaded for e in loop.effects) and any(map(turns, loop.effects)):
+        return _behind_rotors(loop, motion, own, outside, added), {}
     # Terms proportional to acceleration are already on the left-hand side.
     drive, link = effect_loads(loop, motion, own, push=outside.push, inertia=False)
     torque = motion.tau - drive - link + outside.push + outside.pull
     return forward(loop, motion.q, motion.v, torque, added), {}
+
+
+def _behind_rotors(
+    loop: ClosedLoop,
+    motion: Motion,
+    own: tuple[Float[Array, " _"], ...],
+    outside: Outside,
+    added: Float[Array, "joints joints"],
+) -> Float[Array, " joints"]:
+    """Accelerations if friction depends on the torque behind rotors, and so on acceleration.
+
+    Newton's method. Friction is linear in a joint's acceleration between few kinks, so it acts as
+    inertia of the joint.
+
+    **Arguments:**
+
+    - `own`: the effects' own states. `added`: inertia of the effects.
+    """
+
+    def needed(a: Float[Array, " joints"]) -> Float[Array, " joints"]:
+        at = dataclasses.replace(motion, a=a)
+        drive, link = effect_loads(loop, at, own, push=outside.push, inertia=False)
+        return drive + link
+
+    available, a = motion.tau + outside.push + outside.pull, motion.a
+    for _ in range(_KINKS):
+        torque, slope = jax.jvp(needed, (a,), (jnp.ones_like(a),))
+        left = available - torque + slope * a
+        a = forward(loop, motion.q, motion.v, left, added + jnp.diag(slope))
+    return a
 
 
 def _through_transmissions(
@@ -308,7 +343,10 @@ def _through_transmissions(
         apart = apart.at[j].set(there)
         rotors = rotors.at[j].set(jnp.where(there, transmission.rotor, 0.0))
     links = dataclasses.replace(motion, q=q, v=v)
-    drive, held = effect_loads(loop, motion, state.effects, links, push=outside.push, inertia=False)
+    # The acceleration of the rotors is not known here.
+    drive, held = effect_loads(
+        loop, motion, state.effects, links, push=outside.push, inertia=False, turning=False
+    )
     available = motion.tau - drive + outside.push
     on_link = jnp.where(apart, passed, available)
     reaching = on_link - held + outside.pull

@@ -24,13 +24,14 @@ def effect_loads(
     push: Float[Array, " joints"] | float = 0.0,
     curves: bool = True,
     inertia: bool = True,
+    turning: bool = True,
     needed: bool = False,
     grouped: bool = False,
 ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
     """Torque that effects on the drives and on the links require, `(joints,)` each.
 
-    Load-dependent effects come last, because they depend on the torque minus all other effects.
-    Acceleration is solved for, so terms proportional to it are not subtracted.
+    Load-dependent effects come last, because they depend on the torque minus all other effects,
+    also minus the torque that accelerates the rotors, which does not pass the gears.
 
     **Arguments:**
 
@@ -39,6 +40,7 @@ def effect_loads(
     - `push`: external torque on the drives, which load-dependent effects include.
     - `curves`: False to leave out effects that need an acceleration which is not known yet.
     - `inertia`: False to leave out terms proportional to acceleration.
+    - `turning`: False to count the torque that accelerates rotors as load.
     - `needed`: whether the torque of `motion` is what it needs without load-dependent effects, not
       that of the drives.
     - `grouped`: whether effects of one structure are computed as one array, for many instants. A
@@ -56,9 +58,9 @@ def effect_loads(
 
     link = required(lambda e: e.on_link and not e.loaded, behind, inertia)
     steady = required(lambda e: not (e.on_link or e.loaded or e.inertial), motion)
-    drive = steady + required(_turning, motion, inertia)
+    drive = steady + required(turns, motion, inertia)
     if any(effect.loaded for effect, _ in own):
-        ahead = steady + required(_turning, motion, inertia=False)
+        ahead = steady + required(turns, motion, inertia=turning)
         load = link_load(loop, behind, states)
         left = dataclasses.replace(motion, tau=motion.tau - ahead + push, load=load)
 
@@ -89,8 +91,8 @@ def _with_friction(
     return tau
 
 
-def _turning(effect: AbstractEffect) -> bool:
-    """Whether the torque of an effect on the drives depends on acceleration."""
+def turns(effect: AbstractEffect) -> bool:
+    """Whether the torque of an effect on the drives depends on acceleration, as that of a rotor."""
     return effect.inertial and not (effect.on_link or effect.loaded)
 
 
