@@ -40,12 +40,13 @@ class Motion(eqx.Module):
 
     `t` is in s; `q`, `v`, `a` are in rad or m and their derivatives; `tau` is the torque that the
     drives deliver, N·m or N. `a` is zero unless the effect is `inertial` or `needs_acceleration`.
-    For a `loaded` effect, `tau` is the torque that reaches the links after all other effects on
-    the drives, and `load` is the torque that the links need without accelerating (None for other
-    effects). `state` contains the effect's own states. `label` identifies the recording
-    (`recording_label`). `held` has the recording's signals that are constant from sample to
-    sample, by name (`on`, `supply`). `imposed` is true if the motion does not follow from the
-    torque (unknown law); `a` is then the acceleration, for every effect.
+    For a `loaded` effect, `tau` is the torque that remains after all other effects on the drives,
+    without that which accelerates rotors if the effect is `geared`, and `load` is the torque that
+    the links need without accelerating (None for other effects). `state` contains the effect's own
+    states. `label` identifies the recording (`recording_label`). `held` has the recording's signals
+    that are constant from sample to sample, by name (`on`, `supply`). `imposed` is true if the
+    motion does not follow from the torque (unknown law); `a` is then the acceleration, for every
+    effect.
     """
 
     t: Float[Array, ""]
@@ -71,7 +72,8 @@ class AbstractEffect(eqx.Module):
     - `inertial`: `torque` depends on acceleration and is affine in it.
     - `needs_acceleration`: `torque` depends on acceleration in another way; `a` is then the
       acceleration of the arm without the effect.
-    - `loaded`: `torque` depends on the torque that reaches the link.
+    - `loaded`: `torque` depends on the torque of the drive. `geared`: it depends on the part of it
+      that passes the gear and does not accelerate the rotor.
     - `finite`: it has no derivative at zero amplitude, or one that does not predict its effect, so
       it is screened by simulations with a finite amplitude.
     - `on_link`: `torque` acts on the link, beyond an elastic transmission.
@@ -90,6 +92,7 @@ class AbstractEffect(eqx.Module):
     inertial: ClassVar[bool] = False
     needs_acceleration: ClassVar[bool] = False
     loaded: ClassVar[bool] = False
+    geared: ClassVar[bool] = False
     finite: ClassVar[bool] = False
     on_link: ClassVar[bool] = False
     joint_fields: ClassVar[tuple[str, ...]] = ()

@@ -35,7 +35,7 @@ class LoadDependentFriction(AbstractEffect):
     )
     smoothing: Scalar = smoothing_speed()
     form: Scalar = sign_form()
-    loaded = True
+    loaded = geared = True
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["LoadDependentFriction"]:

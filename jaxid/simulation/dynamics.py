@@ -285,7 +285,7 @@ def _accelerations(
     ]
     if transmissions:
         return _through_transmissions(loop, motion, state, transmissions, outside, added)
-    if any(e.loaded for e in loop.effects) and any(map(turns, loop.effects)):
+    if any(e.geared for e in loop.effects) and any(map(turns, loop.effects)):
         return _behind_rotors(loop, motion, own, outside, added), {}
     # Terms proportional to acceleration are already on the left-hand side.
     drive, link = effect_loads(loop, motion, own, push=outside.push, inertia=False)

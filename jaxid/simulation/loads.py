@@ -30,8 +30,8 @@ def effect_loads(
 ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
     """Torque that effects on the drives and on the links require, `(joints,)` each.
 
-    Load-dependent effects come last, because they depend on the torque minus all other effects,
-    also minus the torque that accelerates the rotors, which does not pass the gears.
+    Load-dependent effects come last, because they depend on the torque minus all other effects, if
+    they are `geared` also minus the torque that accelerates the rotors.
 
     **Arguments:**
 
@@ -40,7 +40,7 @@ def effect_loads(
     - `push`: external torque on the drives, which load-dependent effects include.
     - `curves`: False to leave out effects that need an acceleration which is not known yet.
     - `inertia`: False to leave out terms proportional to acceleration.
-    - `turning`: False to count the torque that accelerates rotors as load.
+    - `turning`: False if the acceleration of the rotors is not known.
     - `needed`: whether the torque of `motion` is what it needs without load-dependent effects, not
       that of the drives.
     - `grouped`: whether effects of one structure are computed as one array, for many instants. A
@@ -60,12 +60,16 @@ def effect_loads(
     steady = required(lambda e: not (e.on_link or e.loaded or e.inertial), motion)
     drive = steady + required(turns, motion, inertia)
     if any(effect.loaded for effect, _ in own):
-        ahead = steady + required(turns, motion, inertia=turning)
+        ahead = steady + required(turns, motion, inertia=False)
+        rotors = steady + required(turns, motion) - ahead
         load = link_load(loop, behind, states)
         left = dataclasses.replace(motion, tau=motion.tau - ahead + push, load=load)
 
         def by_load(tau: Float[Array, " joints"]) -> Float[Array, " joints"]:
-            return required(lambda e: e.loaded, dataclasses.replace(left, tau=tau))
+            whole = dataclasses.replace(left, tau=tau)
+            passed = dataclasses.replace(left, tau=tau - rotors) if turning else whole
+            by_drive = required(lambda e: e.loaded and not e.geared, whole)
+            return by_drive + required(lambda e: e.loaded and e.geared, passed)
 
         tau = _with_friction(by_load, left.tau) if needed else left.tau
         drive = drive + by_load(tau)
