@@ -91,8 +91,8 @@ def _far(names: list[str], moved: Float[np.ndarray, " values"]) -> list[str]:
     which = ", ".join(f"{names[k]} by {moved[k]:.3g}" for k in order)
     return [
         "the links differ from the drawing by more than its uncertainty allows, most of all, in "
-        f"its standard deviations, {which}: it is wrong there, or the links have absorbed an "
-        'effect that the model lacks; bodies="drawn" makes it visible'
+        f"its standard deviations, {which}: the drawing is wrong there, or the links have absorbed "
+        'an effect that the model lacks; bodies="drawn" makes it visible'
     ]
 
 
