@@ -213,7 +213,10 @@ def test_the_bodies_of_a_urdf_are_estimated_if_asked(tmp_path):
         assert any(p.declaration.symbol == "base" for p in loop.free_parameters)
     assert near.arm.covariance is not None
     assert free.arm.covariance is None
-    with pytest.raises(ModelError, match="bodies is 'far': give 'drawn', 'near' or 'free'"):
+    assert "density1" in [n for p in load_robot(f"{file}:physical").parameters for n in p.names]
+    with pytest.raises(
+        ModelError, match="bodies is 'far': give 'drawn', 'near', 'physical' or 'free'"
+    ):
         load_robot(f"{file}:far")
 
 
