@@ -11,6 +11,7 @@ from jaxid.control import Cascade
 from jaxid.effects import AsymmetricFriction, TorqueOffset
 from jaxid.errors import FitError
 from jaxid.estimate.idim import Stacked, solve
+from jaxid.estimate.result import determined_covariance
 from jaxid.signals.smoothing import low_pass, signal_cutoff
 
 # Janot, Gautier, Brunot 2019: value and standard deviation.
@@ -300,3 +301,12 @@ def test_the_cutoff_of_two_recordings_follows_from_both():
     rows = slice(0, one.samples // 2, 2)
     short = jaxid.Recording.from_arrays(one.time[rows], one.q[rows], one.tau[rows], name="short")
     assert 10.0 < signal_cutoff(one, short) <= 125 / 8
+
+
+def test_a_combination_of_many_parameters_is_told_by_its_largest_terms():
+    names = tuple(f"x{k}" for k in range(1, 10))
+    along = np.array([9.0, 1, 2, 3, 4, 5, 6, 7, 8])
+    information = np.eye(9) - np.outer(along, along) / (along @ along)
+    _, (said,) = determined_covariance(information, names, np.ones(9))
+    assert said.startswith("these recordings do not determine x1, x9, x8, x7, x6, x5 and 3 more: ")
+    assert said.endswith("·x5 and smaller terms")

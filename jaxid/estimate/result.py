@@ -282,6 +282,10 @@ def errors_to_dict(errors: "pd.DataFrame") -> dict[str, list[float | None]]:
     }
 
 
+# Largest number of parameters that a sentence on a combination lists.
+_MANY = 6
+
+
 def determined_covariance(
     information: Float[np.ndarray, "parameters parameters"],
     names: Sequence[str],
@@ -321,16 +325,30 @@ def determined_covariance(
         part = np.abs(direction) > 1e-3
         lost |= part
         involved = [(name, x) for name, x, on in zip(names, along, part, strict=True) if on]
-        terms = " ".join(f"{x:+.3g}·{name}" for name, x in involved)
-        sentences.append(
-            f"these recordings do not determine {', '.join(name for name, _ in involved)}: "
-            f"the signals do not change along {terms}"
-        )
+        sentences.append(_without_change(involved))
     covariance = np.array(covariance)
     covariance[lost, :] = 0.0
     covariance[:, lost] = 0.0
     covariance[lost, lost] = np.inf
     return covariance, tuple(sentences)
+
+
+def _without_change(involved: list[tuple[str, float]]) -> str:
+    """The sentence on a combination of parameters that does not change the signals.
+
+    **Arguments:**
+
+    - `involved`: names and shares; if there are many, only the largest are in the sentence.
+    """
+    kept, names, more = involved, ", ".join(name for name, _ in involved), ""
+    if len(involved) > _MANY:
+        kept = sorted(involved, key=lambda one: -abs(one[1]))[:_MANY]
+        names = f"{', '.join(name for name, _ in kept)} and {len(involved) - _MANY} more"
+        more = " and smaller terms"
+    terms = " ".join(f"{x:+.3g}·{name}" for name, x in kept)
+    return (
+        f"these recordings do not determine {names}: the signals do not change along {terms}{more}"
+    )
 
 
 def unphysical(loop: ClosedLoop) -> list[str]:
