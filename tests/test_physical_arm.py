@@ -154,3 +154,9 @@ def test_a_link_that_is_no_body_is_refused():
     text = four_joints().replace('<mass value="3"/>', '<mass value="0"/>')
     with pytest.raises(ModelError, match="link 2 is drawn with a mass of 0 kg"):
         jaxid.serial(text, bodies="physical")
+
+
+def test_a_copy_with_other_bodies_deforms_these():
+    arm = loop().arm
+    other = dataclasses.replace(arm, bodies=2.0 * arm.bodies)
+    np.testing.assert_allclose(other.inertias(), 2.0 * arm.inertias(), rtol=1e-12)

@@ -74,14 +74,13 @@ class PhysicalArm(AbstractSerialArm):
     gears: tuple[tuple[float, ...], ...] | None = eqx.field(static=True, default=None)
     deformation: Vector = parameter(None, symbol="deformation", unit="1", scale=0.2, linear=False)
     uncertainty: float = eqx.field(static=True, default=0.2)
-    # Upper triangular roots of the drawn pseudo-inertias; computed if left out.
+    # Upper triangular roots of the drawn pseudo-inertias. They follow from `bodies`, also in a copy
+    # with other bodies, so a given value is not used.
     roots: Float[Array, "joints 4 4"] = eqx.field(converter=as_float64, default=None)
 
     def __post_init__(self):
-        if self.roots is None:
-            self.roots = jnp.asarray(
-                [_root(k, body) for k, body in enumerate(np.asarray(self.bodies))]
-            )
+        bodies = np.asarray(self.bodies)
+        self.roots = as_float64(np.stack([_root(k, body) for k, body in enumerate(bodies)]))
         if self.deformation is None:
             self.deformation = jnp.zeros(self.bodies.size)
 

@@ -311,8 +311,8 @@ def _behind_rotors(
     """
 
     def needed(a: Float[Array, " joints"]) -> Float[Array, " joints"]:
-        at = dataclasses.replace(motion, a=a)
-        drive, link = effect_loads(loop, at, own, push=outside.push, inertia=False)
+        push = outside.push
+        drive, link = effect_loads(loop, motion, own, push=push, inertia=False, spinning=a)
         return drive + link
 
     available, a = motion.tau + outside.push + outside.pull, motion.a
@@ -344,9 +344,8 @@ def _through_transmissions(
         rotors = rotors.at[j].set(jnp.where(there, transmission.rotor, 0.0))
     links = dataclasses.replace(motion, q=q, v=v)
     # The acceleration of the rotors is not known here.
-    drive, held = effect_loads(
-        loop, motion, state.effects, links, push=outside.push, inertia=False, turning=False
-    )
+    none, own, push = jnp.zeros_like(q), state.effects, outside.push
+    drive, held = effect_loads(loop, motion, own, links, push=push, inertia=False, spinning=none)
     available = motion.tau - drive + outside.push
     on_link = jnp.where(apart, passed, available)
     reaching = on_link - held + outside.pull

@@ -24,7 +24,7 @@ def effect_loads(
     push: Float[Array, " joints"] | float = 0.0,
     curves: bool = True,
     inertia: bool = True,
-    turning: bool = True,
+    spinning: Float[Array, " joints"] | None = None,
     needed: bool = False,
     grouped: bool = False,
 ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
@@ -40,7 +40,8 @@ def effect_loads(
     - `push`: external torque on the drives, which load-dependent effects include.
     - `curves`: False to leave out effects that need an acceleration which is not known yet.
     - `inertia`: False to leave out terms proportional to acceleration.
-    - `turning`: False if the acceleration of the rotors is not known.
+    - `spinning`: acceleration of the rotors that `geared` effects are behind, `(joints,)`, rad/s²
+      or m/s²; that of `motion` if None.
     - `needed`: whether the torque of `motion` is what it needs without load-dependent effects, not
       that of the drives.
     - `grouped`: whether effects of one structure are computed as one array, for many instants. A
@@ -61,13 +62,13 @@ def effect_loads(
     drive = steady + required(turns, motion, inertia)
     if any(effect.loaded for effect, _ in own):
         ahead = steady + required(turns, motion, inertia=False)
-        rotors = steady + required(turns, motion) - ahead
+        spun = motion if spinning is None else dataclasses.replace(motion, a=spinning)
+        rotors = required(turns, spun) - required(turns, motion, inertia=False)
         load = link_load(loop, behind, states)
         left = dataclasses.replace(motion, tau=motion.tau - ahead + push, load=load)
 
         def by_load(tau: Float[Array, " joints"]) -> Float[Array, " joints"]:
-            whole = dataclasses.replace(left, tau=tau)
-            passed = dataclasses.replace(left, tau=tau - rotors) if turning else whole
+            whole, passed = (dataclasses.replace(left, tau=x) for x in (tau, tau - rotors))
             by_drive = required(lambda e: e.loaded and not e.geared, whole)
             return by_drive + required(lambda e: e.loaded and e.geared, passed)
 
