@@ -68,7 +68,7 @@ EFFECTS = (
 OF_DRAWN = ("rotor_inertia", "counterbalance")
 RATE, DURATION, WRONG = 250, 10.0, 0.2
 NAMES = ("fit_1", "fit_2", "held_out")
-# Number of draws of a case until its law is stable.
+# Number of draws of a case until its law is stable and its joints do not lock.
 _DRAWS = 5
 
 
@@ -126,12 +126,18 @@ def draw_wanted(master: int, count: int, law: str) -> list[Wanted]:
     return found
 
 
+class SelfLocking(ValueError):
+    """A drawn friction above the load on which it depends, so that no link could move its drive."""
+
+
 def make(wanted: Wanted) -> Case:
-    """The case, simulated; drawn again if its law is unstable."""
+    """The case, simulated; drawn again if its law is unstable or its joint locks itself."""
     for seed in range(wanted.seed, wanted.seed + _DRAWS):
-        with suppress(Unstable):
+        with suppress(Unstable, SelfLocking):
             return _made(replace(wanted, seed=seed))
-    raise Unstable(f"case {wanted.number} has no stable law in {_DRAWS} draws")
+    raise ValueError(
+        f"case {wanted.number} has no stable law, or only joints that lock, in {_DRAWS} draws"
+    )
 
 
 def _made(wanted: Wanted) -> Case:
@@ -271,6 +277,8 @@ def _hide(
     # Five to twenty times the noise before parameters absorb a part.
     times = math.exp(rng.uniform(math.log(5), math.log(20)))
     numbers["size"] = float(times * level[j] / plain[j])
+    if wanted.effect == "load_dependent_friction" and numbers["size"] >= 1.0:
+        raise SelfLocking(f"friction of {numbers['size']:.2g} times the load on joint {j + 1}")
     made = replace(plant, extra=((wanted.effect, j, numbers),))
     return [made] * len(NAMES), j + 1, numbers
 

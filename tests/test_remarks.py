@@ -6,7 +6,7 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_release import arctan, axis, recorded
+from test_release import MASS, arctan, axis, recorded, tanh
 
 import jaxid
 from jaxid.discovery.remarks import remarks
@@ -74,3 +74,29 @@ def test_an_effect_with_uncertain_values_is_told_with_what_can_replace_it(fitted
 
     assert re.search(r"each value of stribeck on joint 1 is uncertain.*lead1.*the sum", told(2.0))
     assert "is uncertain" not in told(0.04)
+
+
+def with_friction_by_load(ratio):
+    """A recording of an axis with further friction, a multiple of the torque of its inertia."""
+    plain = recorded(1, tanh)
+    v = np.gradient(plain.q[:, 0], plain.time)
+    a = np.gradient(v, plain.time)
+    tau = plain.tau[:, 0] + ratio * np.abs(MASS * a) * tanh(v)
+    return jaxid.Recording.from_arrays(plain.time, plain.q, tau, name="run")
+
+
+@pytest.mark.parametrize(("ratio", "forbidden"), [(2.0, True), (0.8, False)])
+def test_an_effect_that_needs_forbidden_values_is_told(ratio, forbidden):
+    fit = jaxid.fit(axis(), with_friction_by_load(ratio), jaxid.OEM(progress=False))
+    found = jaxid.diagnose(fit)
+    assert found.ranking[0].key == ("load_dependent_friction", 1)
+    assert found.ranking[0].possible is not forbidden
+    said = " | ".join(remarks([Step("start", fit, None, found)], axis(), {}))
+    told = re.search(
+        r"load_dependent_friction on joint 1 would explain \d+ % of .* "
+        r"alpha1 = ([\d.]+) ± ([\d.]+) \(bounds 0, 0\.95\)",
+        said,
+    )
+    assert bool(told) == forbidden
+    # The fit may absorb a part of it, but not so much that another value is said.
+    assert not told or float(told[1]) == pytest.approx(ratio, rel=0.1)

@@ -12,7 +12,9 @@ from ..simulation.batch import motion_cutoff
 from ..simulation.loop import ClosedLoop
 from ..simulation.widening import LEAD
 from .alongside import LATE
-from .hypotheses import effect_on
+from .diagnosis import Diagnosis
+from .explore import DECISIVE
+from .hypotheses import amplitudes, effect_on
 from .models import named
 from .offsets import held_offsets
 from .step import Step, found_parameters
@@ -22,7 +24,7 @@ from .text import joined
 def remarks(
     steps: Sequence[Step], given: ClosedLoop, offsets: Mapping[str, AbstractEffect]
 ) -> tuple[str, ...]:
-    """Notes on failed fits, released values, offsets, slow motion and an undeclared sampled law.
+    """Notes on failed fits, released values, offsets, bounds, slow motion and late drives.
 
     **Arguments:**
 
@@ -33,7 +35,7 @@ def remarks(
     said = [f"the fit of {', '.join(bad)} did not converge: use its values with care"]
     last = steps[-1].fit
     more = (*_estimated(last, given), *_delayed(last, given), *_instead(last, given, offsets))
-    more = (*more, *_uncertain(steps))
+    more = (*more, *_uncertain(steps), *_out_of_bounds(steps[-1].diagnosis))
     more = (*more, *slow_note(given.standstill, last.loop), *looks_sampled(last))
     return (*(said if bad else ()), *more)
 
@@ -61,6 +63,36 @@ def _uncertain(steps: Sequence[Step]) -> list[str]:
                 f"recordings determine only the sum of the effects on joint {joint}"
             )
     return found
+
+
+# Share of the residual that an effect out of its bounds must explain to be mentioned.
+_MUCH = 0.1
+
+
+def _out_of_bounds(diagnosis: Diagnosis | None) -> list[str]:
+    """A note on an effect that explains most of all, with values that its bounds forbid."""
+    if diagnosis is None or not diagnosis.ranking:
+        return []
+    first, *others = diagnosis.ranking
+    rivals = [v.evidence for v in (*diagnosis.where, *others) if v.possible]
+    ahead = first.evidence - max(rivals, default=0.0)
+    share = first.explained / diagnosis.gram.rest
+    shown = amplitudes(first.hypothesis.effect)
+    if first.possible or not shown or ahead < DECISIVE or share < _MUCH:
+        return []
+    values, stds = diagnosis.amplitude(first)
+    limits = zip(first.hypothesis.lower, first.hypothesis.upper, strict=True)
+    names = [(n, diagnosis.fit.loop.unit(p)) for p in shown for n in p.names]
+    wrong = [
+        f"{name} = {value:.3g} ± {std:.2g}{'' if unit == '1' else f' {unit}'} (bounds {a:g}, {b:g})"
+        for (name, unit), value, std, (a, b) in zip(names, values, stds, limits, strict=True)
+        if not a <= value <= b
+    ]
+    return [
+        f"{effect_on(*first.key)} would explain {100 * share:.0f} % of the squared residual, more "
+        f"than any other effect or curve, but with {joined(wrong)}: if your robot can have such a "
+        "value, define this effect with wider bounds; otherwise another effect resembles it"
+    ]
 
 
 # What the lead of a friction means: a small one, and one above the time constant of the low-pass.
