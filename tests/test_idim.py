@@ -122,16 +122,18 @@ def test_cutoff_is_where_the_encoder_noise_lifts_the_acceleration():
     assert 20 / 1.6 < signal_cutoff(recording) < 20 * 1.6
 
 
-@pytest.mark.parametrize("seed", [3, 11])
-def test_a_gap_between_reference_and_response_is_not_the_cutoff(seed):
+@pytest.mark.parametrize(("seed", "duration"), [(3, 10), (11, 10), (3, 60), (11, 120)])
+def test_a_gap_between_reference_and_response_is_not_the_cutoff(seed, duration):
     """A loop answers friction at its bandwidth, 6 Hz, with a reference below 0.5 Hz.
 
-    With the second seed the level at 2 Hz is by chance lower than that at 24 Hz.
+    With the second seed the level at 2 Hz is by chance lower than that at 24 Hz. In a long
+    recording of a slower reference the level between the two is lower by far.
     """
     rng = np.random.default_rng(seed)
-    t = np.arange(0.0, 10.0, 0.004)
+    t = np.arange(0.0, duration, 0.004)
     f = np.fft.rfftfreq(len(t), 0.004)[1:]
-    phases = 2 * np.pi * np.outer(t, [0.17, 0.31, 0.43]) + rng.uniform(0, 6, 3)
+    rates = 10 / duration * np.array([0.17, 0.31, 0.43])
+    phases = 2 * np.pi * np.outer(t, rates) + rng.uniform(0, 6, 3)
     # Relative amplitudes of acceleration: the response, and the encoder's noise.
     response = np.exp(-0.5 * (np.log(f / 6.0) / 0.5) ** 2)
     noise = 0.04 * (f / 18.0) ** 2
@@ -284,16 +286,15 @@ def test_instruments_are_unsure_of_what_they_do_not_see():
 
 
 def test_the_cutoff_of_two_recordings_follows_from_both():
-    """One of them has a minimum of its spectrum between reference and response by chance."""
+    """One of them has its lowest level between reference and response by chance."""
     pytest.importorskip("mujoco")
     pytest.importorskip("example_robot_data")
     from benchmarks import six_joints
 
     case = six_joints.make(six_joints.draw_wanted(561126, 40, "unknown")[5])
     one, other, held_out = case.recordings
-    assert signal_cutoff(other) < 3.0 < 15.0 < signal_cutoff(one)
-    assert 15.0 < signal_cutoff(one, other) < 30.0
-    assert 15.0 < signal_cutoff(held_out) < 30.0
+    for some in ((one,), (other,), (one, other), (held_out,)):
+        assert 15.0 < signal_cutoff(*some) < 30.0
     both = jaxid.control.Tracking().settled([one, other])
     assert float(both.cutoff) == pytest.approx(signal_cutoff(one, other))
     assert signal_cutoff(one, one) == signal_cutoff(one)

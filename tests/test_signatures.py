@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.discovery import signatures as responses
 from jaxid.discovery.finite import differences
 from jaxid.discovery.hypotheses import amplitudes, survey
 from jaxid.discovery.linear import linearise
@@ -77,6 +78,22 @@ def test_signature_is_the_derivative_of_a_simulation(record, between):
         error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
         # Torque goes as a line from sample to sample, which misses most where friction is steep.
         assert error < 2e-2, (name, error)
+
+
+def test_signatures_are_the_same_in_small_portions(record, monkeypatch):
+    """On a gear with springs, where some effects act before it, behind it or on the reading."""
+    loop = set_substeps(jaxid.scara().add(SHAFT), 8)
+    batch = prepare(loop, jaxid.Recordings.of(record))
+    linear = linearise(loop, batch, "tau")
+    proposed = [(effect, 1.0) for pair in PAIRS.values() for effect in pair]
+    whole = signatures(loop, batch, linear, proposed, 0, lambda text: None)
+    # Three columns of one portion, so that effects of one class are divided.
+    size = linear.motion.q.shape[1] * 2
+    monkeypatch.setattr(responses, "_ROOM", 3 * size)
+    parts = signatures(loop, batch, linear, proposed, 0, lambda text: None)
+    assert [h.columns for h in parts[0]] == [h.columns for h in whole[0]]
+    largest = np.abs(whole[1]).max(axis=(0, 1, 2))
+    assert np.all(np.abs(parts[1] - whole[1]) <= 1e-5 * largest)
 
 
 class Rattle(AbstractEffect):

@@ -202,9 +202,8 @@ def _separations(
     batch = prepare(loop, drawn)
     linear = linearise(loop, batch, "tau")
     proposed = [(v.hypothesis.effect, 1.0) for v in chosen]
-    hypotheses, table = signatures(loop, batch, linear, proposed, 0, lambda text: None)
+    hypotheses, rows = signatures(loop, batch, linear, proposed, 0, lambda text: None)
     base = at_samples(batch, np.asarray(base_columns(linear, loop.theta.shape[0], False)))
-    rows = at_samples(batch, table)
     seen = sampled(batch, np.asarray(linear.seen))
     kept = np.asarray(batch.kept)
     columns = [list(h.columns) for h in hypotheses]

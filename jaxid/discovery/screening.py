@@ -21,7 +21,7 @@ from .comparison import Comparison
 from .data import Data
 from .diagnosis import Diagnosis
 from .hypotheses import Hypothesis, candidates, curves, survey
-from .linear import at_rows, at_samples
+from .linear import at_rows
 from .ranking import Screened, judge
 from .signatures import signatures
 from .system import System
@@ -77,7 +77,7 @@ def screen(fit: Fit | Comparison, catalogue: Sequence[Any], say: Callable[[str],
     data = Data(
         residual=system.residual,
         base=system.base,
-        table=at_samples(system.batch, table),
+        table=table,
         mask=system.mask,
         known=system.known,
     )
@@ -157,7 +157,7 @@ def _can_be_told(loop: ClosedLoop, effect: AbstractEffect) -> bool:
 def _check_finite(
     loop: ClosedLoop,
     hypotheses: Sequence[Hypothesis],
-    table: Float[np.ndarray, "recordings points outputs columns"],
+    table: Float[np.ndarray, "recordings rows outputs columns"],
 ) -> None:
     """Raises `FitError` if a signature is not finite."""
     there = np.asarray(np.isfinite(table).all(axis=(0, 1, 2)))

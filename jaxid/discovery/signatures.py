@@ -1,6 +1,5 @@
 """Signatures: the change of the closed loop's output that an effect would cause."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,7 +12,6 @@ from jaxtyping import Array, Float
 from ..compiling import compiled
 from ..effects import AbstractEffect, Motion
 from ..effects.placed import Placed, alike, along_effects
-from ..linear_algebra import exponential
 from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..simulation.batch import Batch
 from ..simulation.loads import effect_loads
@@ -22,76 +20,8 @@ from ..simulation.runs import each
 from ..simulation.sharing import at_once, one_by_one, taken
 from .finite import differences
 from .hypotheses import Hypothesis, amplitudes, free_of
-from .linear import Linearised, respond
-
-# Slopes that differ by less, relative to the largest one, share their exponential: sample times are
-# often rounded.
-_SAME = 1e-3
-
-
-def _settled_states(effect: AbstractEffect, motion: Motion) -> Float[Array, "points states"]:
-    """The effect's own states along a motion, by an exponential step for each interval.
-
-    Friction and lags make the states stiff. The step is exact if the rate is linear in the state
-    and its input is linear from sample to sample.
-    """
-    first = jax.tree.map(lambda leaf: leaf[0], motion)
-    start = effect.settled(eqx.tree_at(lambda m: m.state, first, effect.initial_state()))
-    n = start.shape[0]
-    if n == 0:
-        return jnp.zeros((motion.t.shape[0], 0))
-    # One state has a closed form. Otherwise an exponential is computed where the slope changes.
-    weights = _weights_of_one if n == 1 else _weights
-
-    def body(carry, pair):
-        (x, known), (now, then) = carry, pair
-        middle = jax.tree.map(lambda a, b: 0.5 * (a + b), now, then)
-        middle = dataclasses.replace(middle, label=now.label)
-
-        def rate(state, at):
-            return effect.derivative(eqx.tree_at(lambda m: m.state, at, state))
-
-        h = then.t - now.t
-        slope, begin, end = jax.jacfwd(rate)(x, middle), rate(x, now), rate(x, then)
-        known = weights(h * slope, known)
-        return (x + known.rate @ (h * begin) + known.change @ (h * (end - begin)), known), x
-
-    following = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), motion)
-    # No slope is known at first.
-    known = _Weights(jnp.full((n, n), jnp.inf), jnp.eye(n), jnp.eye(n))
-    return jax.lax.scan(body, (start, known), (motion, following))[1]
-
-
-class _Weights(eqx.Module):
-    """Matrices W and V with x(1) - x(0) = W r + V c, for x' = slope (x - x(0)) + r + t c."""
-
-    slope: Float[Array, "states states"]
-    rate: Float[Array, "states states"]
-    change: Float[Array, "states states"]
-
-
-def _weights_of_one(slope: Float[Array, "1 1"], known: _Weights) -> _Weights:
-    small = jnp.abs(slope) < 1e-4
-    safe = jnp.where(small, 1.0, slope)
-    rate = jnp.where(small, 1 + slope / 2, jnp.expm1(safe) / safe)
-    change = jnp.where(small, 0.5 + slope / 6, (rate - 1) / safe)
-    return _Weights(slope, rate, change)
-
-
-def _weights(slope: Float[Array, "states states"], known: _Weights) -> _Weights:
-    """The known matrices, unless the slope is another one."""
-    n = slope.shape[0]
-
-    def computed() -> _Weights:
-        # The integrals are blocks of the exponential of a larger matrix (Van Loan 1978).
-        zero, one = jnp.zeros((n, n)), jnp.eye(n)
-        blocks = [[slope, one, zero], [zero, zero, one], [zero, zero, zero]]
-        found = exponential(jnp.block(blocks))
-        return _Weights(slope, found[:n, n : 2 * n], found[:n, 2 * n :])
-
-    apart = jnp.max(jnp.abs(slope - known.slope)) > _SAME * jnp.max(jnp.abs(slope))
-    return jax.lax.cond(apart, computed, lambda: known)
-
+from .linear import Linearised, at_samples, respond
+from .own_states import settled_states
 
 Forces = tuple[
     Float[Array, "*points joints columns"],
@@ -125,7 +55,7 @@ def _force_by(
     def along(values: Float[Array, " values"]):
         here = write_values(effect, parameters, values) if parameters else effect
         # Computed here, because a parameter may affect the rate of a state.
-        states = _settled_states(here, motion)
+        states = settled_states(here, motion)
 
         def one(at: Motion, state, rest):
             at = eqx.tree_at(lambda m: m.state, at, state)
@@ -218,7 +148,7 @@ def _left_for_links(loop: ClosedLoop, motion: Motion) -> Float[Array, "recording
         return at.tau - effect_loads(loop, at, states, grouped=True)[0]
 
     def along(run: Motion):
-        states = tuple(_settled_states(effect, run) for effect in loop.effects)
+        states = tuple(settled_states(effect, run) for effect in loop.effects)
         return jax.vmap(remaining)(run, states)
 
     return jax.vmap(along)(motion)
@@ -270,32 +200,78 @@ def misreads(effect: AbstractEffect) -> bool:
     return type(effect).read is not AbstractEffect.read
 
 
+# Largest number of forces, in single precision, that are computed at once for one recording. Those
+# of all hypotheses along a minute at 500 Hz need 5 GB for an arm of seven joints. What is compared
+# of them needs a tenth.
+_ROOM = 1 << 27
+
+
 def _responses(
     loop: ClosedLoop,
+    batch: Batch,
     linear: Linearised,
-    stacks: list[Placed],
+    stacks: Sequence[tuple[Placed, int]],
     hypotheses: Sequence[Hypothesis],
-) -> Float[np.ndarray, "recordings points outputs columns"]:
-    """Responses to effects that are inputs of the linear system, one run after the other.
+) -> Float[np.ndarray, "recordings rows outputs columns"]:
+    """What is compared of responses to effects that are inputs of the linear system.
 
-    The forces of all runs together would be several times as large as the table.
+    **Arguments:**
+
+    - `stacks`: stacked effects, with the number of columns of each.
+    - `hypotheses`: the same effects with their columns.
     """
-    reading = _columns(hypotheses, misreads)
-    behind = _columns(hypotheses, lambda e: e.on_link) if "pull" in linear.places else []
+    reading = np.array(_columns(hypotheses, misreads), int)
+    behind = np.array(
+        _columns(hypotheses, lambda e: e.on_link) if "pull" in linear.places else [], int
+    )
     left = left_for_links(loop, linear.motion)
+    portions = _portions(stacks, left.shape[1] * left.shape[2])
 
-    def along(k: int) -> Float[np.ndarray, "points outputs columns"]:
-        alone, remaining = taken((linear, left), np.array([k]))
-        push, noise, rate = _all_forces(stacks, alone.motion, remaining)
-        table = np.array(respond(alone, "push", push))
-        if reading:
-            table[..., reading] += respond(alone, "noise", noise)
-            table[..., reading] += respond(alone, "rate", rate)
-        if behind:
-            table[..., behind] = respond(alone, "pull", push[..., np.array(behind)])
-        return table[0]
+    def along(k: int) -> Float[np.ndarray, "rows outputs columns"]:
+        alone, one, remaining = taken((linear, batch, left), np.array([k]))
+        found, first = [], 0
+        for portion in portions:
+            push, noise, rate = _all_forces(portion, alone.motion, remaining)
+            last = first + push.shape[-1]
+            table = np.array(respond(alone, "push", push))
+            own, linked = (c[(c >= first) & (c < last)] - first for c in (reading, behind))
+            if len(own):
+                table[..., own] += respond(alone, "noise", noise)
+                table[..., own] += respond(alone, "rate", rate)
+            if len(linked):
+                table[..., linked] = respond(alone, "pull", push[..., linked])
+            found.append(at_samples(one, table)[0])
+            first = last
+        return np.concatenate(found, axis=-1)
 
     return np.stack(at_once(along, range(len(left))))
+
+
+def _portions(stacks: Sequence[tuple[Placed, int]], size: int) -> list[list[Placed]]:
+    """Stacked effects, divided so that a portion has few forces; at least one effect each.
+
+    **Arguments:**
+
+    - `stacks`: as for `_responses`. `size`: number of forces of one column.
+    """
+    found: list[list[Placed]] = [[]]
+    room = _ROOM // size
+    for stacked, width in stacks:
+        count, first = len(stacked.own), 0
+        while first < count:
+            fits = room // width
+            if not fits and found[-1]:
+                found.append([])
+                room = _ROOM // size
+                continue
+            last = min(count, first + max(1, fits))
+            found[-1].append(_some(stacked, slice(first, last)))
+            room, first = room - width * (last - first), last
+    return found
+
+
+def _some(stacked: Placed, rows: slice) -> Placed:
+    return jax.tree.map(lambda x: x[rows] if eqx.is_array_like(x) else x, stacked)
 
 
 def _columns(
@@ -311,8 +287,8 @@ def signatures(
     proposed: Sequence[tuple[AbstractEffect, float]],
     row: int,
     say: Callable[[str], None],
-) -> tuple[list[Hypothesis], Float[np.ndarray, "recordings points outputs columns"]]:
-    """Hypotheses and the table of their signatures, one column per amplitude.
+) -> tuple[list[Hypothesis], Float[np.ndarray, "recordings rows outputs columns"]]:
+    """Hypotheses and the compared part of their signatures, one column per amplitude.
 
     For effects at the joint, on the command or on the sensor, a signature is the response of the
     linear system. For transmissions and limits it is the difference between a simulation with the
@@ -320,19 +296,20 @@ def signatures(
     """
     direct = [k for k, (effect, _) in enumerate(proposed) if not effect.finite]
     made: dict[int, Hypothesis] = {}
-    blocks, at = [], 0
+    blocks, widths, at = [], [], 0
     groups = alike([proposed[k][0] for k in direct], loop.joints)
     if groups:
         say(f"{len(direct)} signatures by linear response")
         for _, places in groups:
             low, high = _amplitude_bounds(proposed[direct[places[0]]][0])
+            widths.append(len(low))
             for place in places:
                 effect, tests = proposed[direct[place]]
                 columns = tuple(range(at, at + len(low)))
                 made[direct[place]] = Hypothesis(effect, columns, low, high, tests)
                 at += len(low)
-        stacks = [stacked for stacked, _ in groups]
-        blocks.append(_responses(loop, linear, stacks, list(made.values())))
+        stacks = [(stacked, width) for (stacked, _), width in zip(groups, widths, strict=True)]
+        blocks.append(_responses(loop, batch, linear, stacks, list(made.values())))
     rest = [k for k in range(len(proposed)) if k not in made]
     say(f"{len(rest)} signatures by simulation")
     nominal = linear.seen[:, :, row]
@@ -342,7 +319,7 @@ def signatures(
         with np.errstate(over="ignore"):  # a diverging loop is left out
             column = change.astype(np.float32)
         if np.isfinite(column).all():
-            blocks.append(column[..., None])
+            blocks.append(at_samples(batch, column[..., None]))
             made[place] = Hypothesis(effect, (at,), *_amplitude_bounds(effect), tests)
             at += 1
     return [made[k] for k in sorted(made)], np.concatenate(blocks, axis=-1)

@@ -88,10 +88,11 @@ def signal_cutoff(*recordings: Recording, highest: float = 1 / 8) -> float:
 
     The spectrum of the acceleration, f⁴ times that of position, decreases until the encoder's noise
     raises it again. The result is its minimum, summed over joints relative to their speed, and over
-    recordings. Of minima of about the same level the last is chosen, because another one may be
-    between the frequencies of the reference and those of the loop's response to friction. It is at
-    least five times the frequency of largest speed. For recordings too short for a spectrum it is a
-    tenth of the sample rate.
+    recordings. Another minimum may be between the frequencies of the reference and those of the
+    loop's response to friction. So a later minimum is chosen if it has about the same level, or if
+    there is motion before it, far above the encoder's noise and the minimum itself. The result is
+    at least five times the frequency of largest speed. For recordings too short for a spectrum it
+    is a tenth of the sample rate.
 
     **Arguments:**
 
@@ -108,7 +109,7 @@ def signal_cutoff(*recordings: Recording, highest: float = 1 / 8) -> float:
     centres, levels = zip(*(_acceleration(r, edges) for r in long), strict=True)
     centre, level = centres[0], np.sum(levels, axis=0)
     least = 5 * centre[int(np.argmax(level / centre**2))]
-    cutoff = centre[_last_minimum(level, centre >= least)]
+    cutoff = centre[_last_minimum(centre, level, centre >= least)]
     return float(min(max(least, cutoff), rate * highest))
 
 
@@ -141,16 +142,33 @@ def _acceleration(
     return centre, n / rate * np.array([acceleration[low:high].mean() for low, high in bands])
 
 
-# Ratio of the levels of two bands that may be random: a band at low frequencies has few lines.
-_TIED = 1.5
+# Ratio of the levels of two bands that may be random: a band at low frequencies has few lines. And
+# that of a level to noise, and to a later minimum, above which it is motion.
+_TIED, _MOTION = 1.5, 4.0
 
 
-def _last_minimum(level: Float[np.ndarray, " bands"], allowed: Bool[np.ndarray, " bands"]) -> int:
-    """The band of the lowest level; of minima that are tied, that of the highest frequency."""
+def _last_minimum(
+    centre: Float[np.ndarray, " bands"],
+    level: Float[np.ndarray, " bands"],
+    allowed: Bool[np.ndarray, " bands"],
+) -> int:
+    """The band of the lowest level, or of a later minimum that is tied or has motion before it.
+
+    In a long recording of a slow motion the gap between the reference and the response to friction
+    is the lowest minimum: the sums of sines of a Panda, below 0.5 Hz for 60 s, had a cutoff of
+    0.7 Hz, although the motion is known up to 30 Hz.
+    """
     lowest = int(np.argmin(np.where(allowed, level, np.inf)))
     inner = np.flatnonzero((level[1:-1] < level[:-2]) & (level[1:-1] < level[2:])) + 1
     tied = inner[allowed[inner] & (level[inner] <= _TIED * level[lowest])]
-    return max([lowest, *tied.tolist()])
+    found = max([lowest, *tied.tolist()])
+    # The noise of an encoder is white, so at most that of the last band is noise of this kind.
+    noise = level[-1] * (centre / centre[-1]) ** 4
+    for later in inner[inner > found].tolist():
+        most = found + int(np.argmax(level[found:later]))
+        if level[most] > _MOTION * max(level[later], noise[most]):
+            found = later
+    return found
 
 
 class Band(eqx.Module):
