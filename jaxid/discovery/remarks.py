@@ -77,6 +77,7 @@ def _out_of_bounds(diagnosis: Diagnosis | None) -> list[str]:
     rivals = [v.evidence for v in (*diagnosis.where, *others) if v.possible]
     ahead = first.evidence - max(rivals, default=0.0)
     share = first.explained / diagnosis.gram.rest
+    # Without amplitudes, an effect is simulated at a finite setting.
     shown = amplitudes(first.hypothesis.effect)
     if first.possible or not shown or ahead < DECISIVE or share < _MUCH:
         return []
@@ -88,6 +89,8 @@ def _out_of_bounds(diagnosis: Diagnosis | None) -> list[str]:
         for (name, unit), value, std, (a, b) in zip(names, values, stds, limits, strict=True)
         if not a <= value <= b
     ]
+    if not wrong:
+        return []
     return [
         f"{effect_on(*first.key)} would explain {100 * share:.0f} % of the squared residual, more "
         f"than any other effect or curve, but with {joined(wrong)}: if your robot can have such a "

@@ -314,14 +314,17 @@ def signatures(
     say(f"{len(rest)} signatures by simulation")
     nominal = linear.seen[:, :, row]
     changes = differences(loop, batch, [proposed[k][0] for k in rest], row, nominal)
+    simulated = []
     for place, change in zip(rest, changes, strict=True):
         effect, tests = proposed[place]
         with np.errstate(over="ignore"):  # a diverging loop is left out
             column = change.astype(np.float32)
         if np.isfinite(column).all():
-            blocks.append(at_samples(batch, column[..., None]))
+            simulated.append(column)
             made[place] = Hypothesis(effect, (at,), *_amplitude_bounds(effect), tests)
             at += 1
+    if simulated:
+        blocks.append(at_samples(batch, np.stack(simulated, axis=-1)))
     return [made[k] for k in sorted(made)], np.concatenate(blocks, axis=-1)
 
 
