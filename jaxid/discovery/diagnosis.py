@@ -22,7 +22,7 @@ from ..storage.saved import save
 from .comparison import Comparison
 from .data import Data
 from .floor import Floor
-from .hypotheses import Hypothesis, amplitudes, on_recordings
+from .hypotheses import Hypothesis, amplitude_names, amplitudes, on_recordings
 from .score import Gram
 from .separate import leftover
 
@@ -193,11 +193,7 @@ class Diagnosis(AbstractShown):
         total = self.gram.rest
         for verdict in self.ranking:
             values, stds = self.amplitude(verdict)
-            shown = [
-                (name, self.fit.loop.unit(p))
-                for p in amplitudes(verdict.hypothesis.effect)
-                for name in p.names
-            ]
+            shown = amplitude_names(self.fit.loop, verdict.hypothesis.effect)
             rows_of = zip(shown or [("setting", "1")], values, stds, strict=True)
             size = ", ".join(
                 f"{s} {_digits(v, 3)} ± {_digits(d, 1)}{'' if unit == '1' else f' {unit}'}"

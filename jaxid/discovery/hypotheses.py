@@ -53,6 +53,11 @@ def amplitudes(effect: AbstractEffect) -> tuple[Parameter, ...]:
     return tuple(p for p in free_of(effect) if p.declaration.linear)
 
 
+def amplitude_names(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[str, str]]:
+    """Name and unit of each amplitude; none if the effect is screened by simulations."""
+    return [(name, loop.unit(p)) for p in amplitudes(effect) for name in p.names]
+
+
 def free_of(effect: AbstractEffect) -> tuple[Parameter, ...]:
     """The parameters of an effect that a fit estimates unless told otherwise."""
     return tuple(p for p in list_parameters(effect) if p.declaration.free)

@@ -14,7 +14,7 @@ from ..simulation.widening import LEAD
 from .alongside import LATE
 from .diagnosis import Diagnosis
 from .explore import DECISIVE
-from .hypotheses import amplitudes, effect_on
+from .hypotheses import amplitude_names, effect_on
 from .models import named
 from .offsets import held_offsets
 from .step import Step, found_parameters
@@ -76,14 +76,14 @@ def _out_of_bounds(diagnosis: Diagnosis | None) -> list[str]:
     first, *others = diagnosis.ranking
     rivals = [v.evidence for v in (*diagnosis.where, *others) if v.possible]
     ahead = first.evidence - max(rivals, default=0.0)
-    share = first.explained / diagnosis.gram.rest
+    total = diagnosis.gram.rest
     # Without amplitudes, an effect is simulated at a finite setting.
-    shown = amplitudes(first.hypothesis.effect)
-    if first.possible or not shown or ahead < DECISIVE or share < _MUCH:
+    names = amplitude_names(diagnosis.fit.loop, first.hypothesis.effect)
+    much = ahead > DECISIVE and first.explained > _MUCH * total
+    if first.possible or not names or not much:
         return []
     values, stds = diagnosis.amplitude(first)
     limits = zip(first.hypothesis.lower, first.hypothesis.upper, strict=True)
-    names = [(n, diagnosis.fit.loop.unit(p)) for p in shown for n in p.names]
     wrong = [
         f"{name} = {value:.3g} ± {std:.2g}{'' if unit == '1' else f' {unit}'} (bounds {a:g}, {b:g})"
         for (name, unit), value, std, (a, b) in zip(names, values, stds, limits, strict=True)
@@ -92,9 +92,10 @@ def _out_of_bounds(diagnosis: Diagnosis | None) -> list[str]:
     if not wrong:
         return []
     return [
-        f"{effect_on(*first.key)} would explain {100 * share:.0f} % of the squared residual, more "
-        f"than any other effect or curve, but with {joined(wrong)}: if your robot can have such a "
-        "value, define this effect with wider bounds; otherwise another effect resembles it"
+        f"{effect_on(*first.key)} would explain {100 * first.explained / total:.0f} % of the "
+        f"squared residual, more than any other effect or curve, but with {joined(wrong)}: if your "
+        "robot can have such a value, define this effect with wider bounds; otherwise another "
+        "effect resembles it"
     ]
 
 

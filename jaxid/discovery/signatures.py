@@ -296,19 +296,18 @@ def signatures(
     """
     direct = [k for k, (effect, _) in enumerate(proposed) if not effect.finite]
     made: dict[int, Hypothesis] = {}
-    blocks, widths, at = [], [], 0
+    blocks, stacks, at = [], [], 0
     groups = alike([proposed[k][0] for k in direct], loop.joints)
     if groups:
         say(f"{len(direct)} signatures by linear response")
-        for _, places in groups:
+        for stacked, places in groups:
             low, high = _amplitude_bounds(proposed[direct[places[0]]][0])
-            widths.append(len(low))
+            stacks.append((stacked, len(low)))
             for place in places:
                 effect, tests = proposed[direct[place]]
                 columns = tuple(range(at, at + len(low)))
                 made[direct[place]] = Hypothesis(effect, columns, low, high, tests)
                 at += len(low)
-        stacks = [(stacked, width) for (stacked, _), width in zip(groups, widths, strict=True)]
         blocks.append(_responses(loop, batch, linear, stacks, list(made.values())))
     rest = [k for k in range(len(proposed)) if k not in made]
     say(f"{len(rest)} signatures by simulation")
