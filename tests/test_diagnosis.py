@@ -11,7 +11,6 @@ from stories import Bump
 
 import jaxid
 from jaxid.discovery.hypotheses import _inertia, candidates, survey
-from jaxid.discovery.score import Gram, _root, corrected, effective_tests
 from jaxid.effects import Curve, Motion, RotorInertia, TorqueOffset
 
 
@@ -73,32 +72,6 @@ def test_samples_that_are_not_compared_are_not_drawn(bump_story):
     (drawn,) = (t for t in left_out.plot_where().data if t.name == "residual of joint 2")
     assert len(drawn.y) > 100
     assert not np.any(np.asarray(drawn.y) == 0)
-
-
-def test_effective_tests_are_honest():
-    """Of tests that are one and the same there is one; of independent ones, their number."""
-    rng = np.random.default_rng(0)
-    ones = np.ones((40, 40)) + 1e-9 * np.eye(40)
-    same = Gram(ones, np.zeros(40), np.ones(40), 1.0, 1000.0)
-    apart = Gram(np.eye(40), rng.normal(size=40), np.ones(40), 1.0, 1000.0)
-    blocks = [[k] for k in range(40)]
-    # 400 draws give the mean of an exponential to 5 %; three of those.
-    assert effective_tests(same, blocks) == pytest.approx(1.0, rel=0.15)
-    assert effective_tests(apart, blocks) == pytest.approx(40.0, rel=0.15)
-    assert corrected(0.01, 10) == pytest.approx(1 - 0.99**10)
-
-
-def test_noise_of_parallel_columns_has_their_covariance():
-    columns = np.random.default_rng(2).standard_normal((60, 25)).astype(np.float32)
-    columns /= np.linalg.norm(columns, axis=1)[:, None]
-    columns[7], columns[9] = columns[3], 1e-2 * columns[3]
-    gram = (columns @ columns.T).astype(float)
-    root = _root(gram)
-    assert root.shape[1] <= 26
-    np.testing.assert_allclose(root @ root.T, gram, atol=1e-5)
-    gram[4, 4] = np.nan
-    with pytest.raises(np.linalg.LinAlgError):
-        _root(gram)
 
 
 def test_a_joint_that_is_held_still_has_shapes_to_screen():

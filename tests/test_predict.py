@@ -102,8 +102,7 @@ def test_an_amplitude_at_its_bound_is_not_possible(predictor):
 
 def test_entries_beside_a_set_are_those_that_it_lacks(found, predictor):
     _, screened, diagnosis = found
-    data = dataclasses.replace(screened.data, level=diagnosis.data.level)
-    landscape = Landscape.of(screened.system, data, screened.hypotheses, diagnosis.noise)
+    landscape = Landscape.of(screened, diagnosis)
     alone = [e.effect.effect_name() for e in landscape.beside(None)[:4]]
     assert {"stribeck", "spring"} & set(alone)
     spring = predictor.predict([Spring(1, 0.1)])

@@ -137,15 +137,15 @@ def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, .
     if not late.possible or gain < DECISIVE:
         return ()
     white = Whitened.of(data, diagnosis.noise)
-    known = white.signatures.shape[1]
+    known = len(white.size)
     white = white.beside(late.slopes)
     blocks = [h.columns for h in screened.hypotheses if not isinstance(h.effect, _LAGS)]
     own = len(blocks)
     chosen = select(white, [*blocks, range(known, known + len(drives))])
     if own not in chosen:
         return ()
-    others = white.signatures[:, columns_of(blocks, chosen[: chosen.index(own)])]
-    found, std = _beside(late, strong_directions(others.astype(float)))
+    others = white.columns(columns_of(blocks, chosen[: chosen.index(own)]))
+    found, std = _beside(late, strong_directions(others))
     sure = np.all((found > _SURE * std) & (std > 0) & (found < LATE * period))
     return tuple(found.tolist()) if sure else ()
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..errors import FitError
 from ..estimate.minimise import Prior
@@ -110,6 +110,17 @@ class Data(eqx.Module):
         own = self.known.rows[:, slice(0) if base is None else base]
         below = np.pad(own, ((0, 0), (0, x.shape[-1] - own.shape[1])))
         return np.concatenate([rows, below.astype(rows.dtype)])
+
+    def white_signatures(
+        self, output: int, noise: ARFilter
+    ) -> tuple[Float[np.ndarray, "rows some"], Int[np.ndarray, " some"]]:
+        """The whitened signatures of one output, and the numbers of those that are not zero."""
+        own = self.table[:, :, output]
+        columns = np.flatnonzero(own.any(axis=(0, 1)))
+        white = whitened(own[:, :, None, columns], [noise], self.mask)
+        if self.level is not None:
+            white /= self.level[:, output, None, None, None].astype(white.dtype)
+        return white.reshape(-1, len(columns)), columns
 
     def known_left(
         self, taken: Float[np.ndarray, " absorbed"] | None = None

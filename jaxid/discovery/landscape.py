@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, AbstractTransmission, Curve
-from ..noise import ARFilter
 from ..parameters import write_values
 from .bounded import bounded_amplitudes
 from .data import Data
+from .diagnosis import Diagnosis
 from .hypotheses import Hypothesis, amplitudes
 from .predict import Prediction, Predictor
+from .ranking import Screened
 from .score import Gram, Whitened, by_width, explained_by, spanned, strong_directions
-from .system import System
 
 
 class Entry(eqx.Module):
@@ -36,18 +36,12 @@ class Landscape(eqx.Module):
     gram: Gram
 
     @classmethod
-    def of(
-        cls, system: System, data: Data, hypotheses: Sequence[Hypothesis], noise: Sequence[ARFilter]
-    ) -> "Landscape":
-        """A landscape from signatures and noise filters.
-
-        **Arguments:**
-
-        - `data`: has the signatures in its table, and the noise level of each recording.
-        """
-        predictor = Predictor.of(system, noise, data.level)
+    def of(cls, screened: Screened, diagnosis: Diagnosis) -> "Landscape":
+        """The landscape of a fit, from its signatures and its diagnosis with all their products."""
+        data, noise = diagnosis.data, diagnosis.noise
+        predictor = Predictor.of(screened.system, noise, data.level)
         white = Whitened.of(data, noise)
-        return cls(predictor, data, tuple(hypotheses), white, Gram.of_whitened(white))
+        return cls(predictor, data, screened.hypotheses, white, diagnosis.gram)
 
     @property
     def forms(self) -> int:
@@ -68,7 +62,7 @@ class Landscape(eqx.Module):
         residual, taken = self._left(set_)
         made = []
         for first in firsts:
-            own = self.white.signatures[:, list(first.hypothesis.columns)].astype(float)
+            own = self.white.columns(first.hypothesis.columns)
             own = strong_directions(own - taken @ (taken.T @ own))
             basis = np.concatenate([taken, own], axis=1)
             rest = residual - basis @ (basis.T @ residual)
@@ -90,9 +84,8 @@ class Landscape(eqx.Module):
     def _entries(
         self, residual: np.ndarray, taken: np.ndarray, most: int, curves: bool
     ) -> list[Entry]:
-        x, single = self.white.signatures, self.white.signatures.dtype
-        score = (residual.astype(single) @ x).astype(float)
-        across = (taken.astype(single).T @ x).astype(float)
+        score = self.white.products(residual[:, None])[0]
+        across = self.white.products(taken)
         explained, price = np.zeros((2, len(self.hypotheses)))
         inner: dict[int, np.ndarray] = {}
         for places, columns in by_width([h.columns for h in self.hypotheses]):

@@ -174,7 +174,35 @@ def respond(
     - `place`: one of `linear.places`.
     - `values`: one column per hypothesis: N·m or N; rad or m; rad/s or m/s.
     """
-    return one_by_one(lambda one: _response(one[0], place, one[1]), (linear, values))
+    # Only the inputs of the place: the others would be copied for each recording, and a program
+    # would be compiled for each number of free parameters.
+    inputs = linear.inputs(place)
+    b, d = linear.B[..., inputs], linear.D[..., inputs]
+    if linear.direct and place in ("push", "pull"):
+        return one_by_one(lambda one: _direct_response(*one), (d, values))
+    first = _first_state(linear, place)
+    system = linear.A, b, linear.C, d, first
+    return one_by_one(lambda one: _response(*one), (*system, values))
+
+
+def _first_state(linear: Linearised, place: Place) -> Float[Any, "recordings states joints"]:
+    """Derivative of the first state by the inputs of a place at the first point."""
+    joints, last = linear.motion.q.shape[-1], linear.start.shape[-1]
+    if place not in ("noise", "rate"):
+        return np.zeros((*linear.start.shape[:2], joints))
+    # A run starts at the position and velocity that the sensors read.
+    first = last - joints * (2 if place == "noise" else 1)
+    return -linear.start[..., first : first + joints]
+
+
+@compiled
+def _direct_response(
+    d: Float[Any, "recordings points outputs inputs"],
+    values: Float[Any, "recordings points joints columns"],
+) -> Float[Array, "recordings points outputs columns"]:
+    after = jnp.concatenate([values[:, 1:], values[:, -1:]], axis=1)
+    both = jnp.concatenate([values, after], axis=2)
+    return d.astype(values.dtype) @ both
 
 
 # With more states a product of matrices is faster than one loop over the columns: with 36 states
@@ -184,23 +212,20 @@ _FEW_STATES = 16
 
 @compiled
 def _response(
-    linear: Linearised,
-    place: Place,
-    values: Float[Array, "recordings points joints columns"],
+    a: Float[Any, "recordings points states states"],
+    b: Float[Any, "recordings points states inputs"],
+    c: Float[Any, "recordings points outputs states"],
+    d: Float[Any, "recordings points outputs inputs"],
+    first: Float[Any, "recordings states joints"],
+    values: Float[Any, "recordings points joints columns"],
 ) -> Float[Array, "recordings points outputs columns"]:
-    joints, inputs = values.shape[2], linear.inputs(place)
-    if linear.direct and place in ("push", "pull"):
-        after = jnp.concatenate([values[:, 1:], values[:, -1:]], axis=1)
-        both = jnp.concatenate([values, after], axis=2)
-        return linear.D[..., inputs].astype(values.dtype) @ both
-
     def times(matrix, columns):
-        if linear.A.shape[-1] > _FEW_STATES:
+        if a.shape[-1] > _FEW_STATES:
             return matrix @ columns
         # In this form XLA fuses the four products into one loop over the columns.
         return jnp.sum(matrix[:, :, None] * columns[None], axis=1)
 
-    def one(a, b, c, d, start, values):
+    def one(a, b, c, d, first, values):
         def body(carry, step):
             s, now = carry
             a, b, c, d, then = step
@@ -208,16 +233,11 @@ def _response(
             return (times(a, s) + times(b, u), then), times(c, s) + times(d, u)
 
         after = jnp.concatenate([values[1:], values[-1:]])
-        s = jnp.zeros((a.shape[-1], values.shape[-1]), values.dtype)
-        if place in ("noise", "rate"):
-            # A run starts at the position and velocity that the sensors read.
-            first = start.shape[-1] - joints * (2 if place == "noise" else 1)
-            of = start[:, first : first + joints]
-            s = -times(of.astype(values.dtype), values[0])
-        matrices = (x.astype(values.dtype) for x in (a, b[..., inputs], c, d[..., inputs]))
+        s = times(first.astype(values.dtype), values[0])
+        matrices = (x.astype(values.dtype) for x in (a, b, c, d))
         return jax.lax.scan(body, (s, values[0]), (*matrices, after))[1]
 
-    return each(one, linear.A, linear.B, linear.C, linear.D, linear.start, values)
+    return each(one, a, b, c, d, first, values)
 
 
 def sampled(batch: Batch, tree: Any) -> Any:

@@ -18,7 +18,7 @@ from .floor import floor_of
 from .hypotheses import Hypothesis
 from .likelihood import score
 from .linear import at_rows
-from .score import Gram, chance, corrected, effective_tests
+from .score import Gram, Whitened, chance, corrected, effective_tests
 from .separate import columns_of, estimate_noise, leftover
 from .system import System
 
@@ -57,8 +57,9 @@ def _judged(fit: Fit | Comparison, screened: Screened, significance: float) -> D
     windows = len(data.residual) != len(fit.recordings)
     apart = estimate_noise(data.middle(_ENOUGH), blocks, alike=windows)
     data, noise = dataclasses.replace(data, level=apart.data.level), apart.noise
-    gram = Gram.of(data, noise)
-    tests = effective_tests(gram, blocks)
+    white = Whitened.of(data, noise)
+    gram = Gram.of_whitened(white)
+    tests = effective_tests(gram, white.noise(), blocks)
     ranking: dict[tuple[Any, ...], Verdict] = {}
     forms: dict[tuple[Any, ...], Verdict] = {}
     where: dict[tuple[Any, ...], Verdict] = {}

@@ -25,15 +25,34 @@ def strong_directions(x: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray,
     return basis[:, size**2 > WEAK]
 
 
+class Part(eqx.Module):
+    """Some rows of a table of signatures, without columns that are zero there.
+
+    `values` are in single precision, `columns` their numbers.
+    """
+
+    values: Float[np.ndarray, "rows some"]
+    columns: Int[np.ndarray, " some"]
+
+    def places(self, numbers: Int[np.ndarray, "*numbers"]) -> Int[np.ndarray, "*numbers"]:
+        """Places of columns in `values`; -1 for those that are zero there."""
+        at = np.searchsorted(self.columns, numbers)
+        return np.where(np.append(self.columns, -1)[at] == numbers, at, -1)
+
+
 class Whitened(eqx.Module):
     """Residual and signatures, whitened, with the base projected out.
 
-    Signatures are scaled by `size`, their norm before the projection; `count` is the number of
-    remaining degrees of freedom.
+    Most effects act on one joint, so most of a table of signatures is zero before the projection.
+    It is stored in parts, one for each output and one for what is known of the base. `basis` and
+    `across`, the product of basis and table, are for the projection. Signatures are scaled by
+    `size`, their norm before the projection; `count` is the number of remaining degrees of freedom.
     """
 
     residual: Float[np.ndarray, " rows"]
-    signatures: Float[np.ndarray, "rows columns"]
+    parts: tuple[Part, ...]
+    basis: Float[np.ndarray, "rows rank"]
+    across: Float[np.ndarray, "rank columns"]
     size: Float[np.ndarray, " columns"]
     count: float
 
@@ -41,35 +60,104 @@ class Whitened(eqx.Module):
     def of(cls, data: Data, noise: Sequence[ARFilter]) -> "Whitened":
         """The problem of some data, through noise filters."""
         r = data.white_residual(data.residual, noise)
-        z = data.white_columns(data.base, noise, slice(None))
-        x = data.white_columns(data.table, noise)
-        size = np.sqrt(np.einsum("rc,rc->c", x, x))
-        size[size == 0] = 1.0
-        x /= size
-        basis = spanned(z)
+        basis = spanned(data.white_columns(data.base, noise, slice(None)))
         r = r - basis @ (basis.T @ r)
-        single = basis.astype(x.dtype)
-        across = single.T @ x
-        # In parts, because the whole product would be as large as the table.
-        parts = 1 + len(x) // 10_000
-        for some, of in zip(np.array_split(x, parts), np.array_split(single, parts), strict=True):
-            some -= of @ across
+        outputs = [Part(*data.white_signatures(j, filt)) for j, filt in enumerate(noise)]
+        nothing = np.zeros((len(data.known_left()), 0), data.table.dtype)
+        parts = (*outputs, Part(nothing, np.zeros(0, int)))
+        power = np.zeros(data.table.shape[-1])
+        for part in parts:
+            power[part.columns] += np.einsum("rc,rc->c", part.values, part.values)
+        size = np.sqrt(np.where(power > 0, power, 1.0))
+        for part in parts:
+            part.values[...] /= size[part.columns].astype(part.values.dtype)
         unknown = len(data.mask) * sum(f.order for f in noise)
         rows = data.mask.sum() * data.residual.shape[2] + len(data.known_left())
         count = rows - unknown - basis.shape[1]
-        return cls(r, x, size.astype(float), float(count))
+        across = _products(parts, basis, len(size))
+        return cls(r, parts, basis, across, size, float(count))
+
+    def columns(self, numbers: Sequence[int]) -> Float[np.ndarray, "rows some"]:
+        """Some signatures without what the base absorbs."""
+        chosen = np.array(list(numbers), int)
+        found = -self.basis @ self.across[:, chosen]
+        for j, part in enumerate(self.parts):
+            at = part.places(chosen)
+            _rows(found, j, self.parts)[:, at >= 0] += part.values[:, at[at >= 0]]
+        return found
+
+    def products(self, x: Float[np.ndarray, "rows some"]) -> Float[np.ndarray, "some columns"]:
+        """Products of columns with the signatures."""
+        return _products(self.parts, x, len(self.size)) - (x.T @ self.basis) @ self.across
+
+    def within(self, blocks: Int[np.ndarray, "blocks width"]) -> Float[np.ndarray, "blocks w w"]:
+        """Products of the signatures of each block with each other."""
+        # In double precision: the base may leave as little of a column as `WEAK`.
+        along = self.across.T[blocks]
+        found = -along @ along.transpose(0, 2, 1)
+        for part in self.parts:
+            at = part.places(blocks)
+            some = np.flatnonzero((at >= 0).any(axis=1))
+            own = part.values.T[at[some]] * (at[some, :, None] >= 0).astype(float)
+            found[some] += own @ own.transpose(0, 2, 1)
+        return found
+
+    def gram(self) -> Float[np.ndarray, "columns columns"]:
+        """Products of the signatures with each other."""
+        found = -self.across.T @ self.across
+        for part in self.parts:
+            own = part.values.astype(float)
+            found[np.ix_(part.columns, part.columns)] += own.T @ own
+        if not np.isfinite(found).all():
+            raise np.linalg.LinAlgError("the signatures or their products are not finite")
+        return found
+
+    def noise(self, draws: int = 1000, seed: int = 0) -> Float[np.ndarray, "columns draws"]:
+        """Products of the signatures with white noise."""
+        rng = np.random.default_rng(seed)
+        found = np.zeros((len(self.size), draws))
+        along = np.zeros((self.basis.shape[1], draws))
+        for j, part in enumerate(self.parts):
+            drawn = rng.standard_normal((len(part.values), draws), np.float32)
+            found[part.columns] += part.values.T @ drawn
+            along += _rows(self.basis, j, self.parts).T @ drawn
+        return found - self.across.T @ along
+
+    def score(self) -> Float[np.ndarray, " columns"]:
+        """Products of signatures and residual."""
+        return self.products(self.residual[:, None])[0]
 
     def beside(self, columns: Float[np.ndarray, "rows more"]) -> "Whitened":
         """The same with more signatures, which are whitened and without the base already."""
         size = np.linalg.norm(columns, axis=0)
         size[size == 0] = 1.0
-        more = (columns / size).astype(self.signatures.dtype)
-        signatures = np.concatenate([self.signatures, more], axis=1)
-        return Whitened(self.residual, signatures, np.append(self.size, size), self.count)
+        more, known = columns / size, len(self.size)
+        numbers = known + np.arange(len(size))
+        parts = []
+        for j, part in enumerate(self.parts):
+            rows = _rows(more, j, self.parts)
+            values = np.concatenate([part.values, rows.astype(part.values.dtype)], axis=1)
+            parts.append(Part(values, np.append(part.columns, numbers)))
+        across = np.concatenate([self.across, np.zeros((len(self.across), len(size)))], axis=1)
+        size = np.append(self.size, size)
+        return Whitened(self.residual, tuple(parts), self.basis, across, size, self.count)
 
-    def score(self) -> Float[np.ndarray, " columns"]:
-        """Products of signatures and residual."""
-        return (self.residual.astype(self.signatures.dtype) @ self.signatures).astype(float)
+
+def _rows(x: np.ndarray, part: int, parts: Sequence[Part]) -> np.ndarray:
+    """The rows of one part, a view."""
+    outputs = len(parts) - 1
+    last = outputs * len(parts[0].values)
+    return x[last:] if part == outputs else x[part:last:outputs]
+
+
+def _products(
+    parts: Sequence[Part], x: Float[np.ndarray, "rows some"], columns: int
+) -> Float[np.ndarray, "some columns"]:
+    """Products of columns with all parts, before any projection."""
+    found = np.zeros((x.shape[1], columns))
+    for j, part in enumerate(parts):
+        found[:, part.columns] += _rows(x, j, parts).T @ part.values.astype(float)
+    return found
 
 
 class Gram(eqx.Module):
@@ -100,10 +188,8 @@ class Gram(eqx.Module):
     @classmethod
     def of_whitened(cls, white: Whitened) -> "Gram":
         """The products of whitened data."""
-        x = white.signatures
-        gram = (x.T @ x).astype(float)
         rest = float(white.residual @ white.residual)
-        return cls(gram, white.score(), white.size, rest, white.count)
+        return cls(white.gram(), white.score(), white.size, rest, white.count)
 
     def without(self, columns: Sequence[int]) -> "Gram":
         """The same with some columns moved into the base."""
@@ -197,15 +283,18 @@ def chance(value: float, freedom: int) -> float:
     return float(scipy.stats.chi2.sf(value, freedom)) if freedom else 1.0
 
 
-def effective_tests(gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0) -> float:
+def effective_tests(gram: Gram, noise: Float[np.ndarray, "columns draws"], blocks: Blocks) -> float:
     """Effective number of independent tests of the blocks, by noise drawn in their space.
 
     The smallest p-value of correlated tests has the distribution of that of fewer independent ones.
+
+    **Arguments:**
+
+    - `noise`: products of the signatures with white noise.
     """
     import scipy
 
-    root = _root(gram.gram)
-    noise = root @ np.random.default_rng(seed).standard_normal((root.shape[1], draws))
+    draws = noise.shape[1]
     smallest = np.ones(draws)
     for _, columns in by_width(blocks):
         inner = gram.gram[columns[:, :, None], columns[:, None, :]]
@@ -217,22 +306,6 @@ def effective_tests(gram: Gram, blocks: Blocks, draws: int = 1000, seed: int = 0
     # give p-values in the tail that are three times too small.
     lowest = float(np.quantile(smallest, 0.1))
     return max(1.0, float(np.log(0.9) / np.log1p(-lowest)))
-
-
-def _root(gram: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n rank"]:
-    """A matrix whose product with its transpose is a Gram matrix, up to a tenth of `WEAK`.
-
-    Columns in single precision may be parallel up to rounding. A Cholesky decomposition with pivots
-    leaves out what the others explain.
-    """
-    import scipy
-
-    if not np.isfinite(gram).all():
-        raise np.linalg.LinAlgError("the Gram matrix is not finite")
-    lower, pivots, rank, _ = scipy.linalg.lapack.dpstrf(gram, tol=0.1 * WEAK, lower=1)
-    root = np.empty((len(gram), rank))
-    root[pivots - 1] = np.tril(lower)[:, :rank]
-    return root
 
 
 def corrected(p: float, tests: float) -> float:

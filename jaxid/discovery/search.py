@@ -1,6 +1,5 @@
 """The search for missing effects: prediction in the linear system, verification by full fits."""
 
-import dataclasses
 from collections import Counter
 from collections.abc import Sequence
 from itertools import islice
@@ -98,8 +97,7 @@ class Search(Started):
         # The tables are large, so only those of the starting model are stored.
         screened, diagnosis = self.latest or self.screened(at.fit, at.effects)
         self.latest = None
-        data = dataclasses.replace(screened.data, level=diagnosis.data.level)
-        landscape = Landscape.of(screened.system, data, screened.hypotheses, diagnosis.noise)
+        landscape = Landscape.of(screened, diagnosis)
         # At the limit `most` one more effect is searched, to report whether a better set exists.
         left = min(max(self.asked.most - len(at.effects), 1), _AHEAD)
         self.watched.begin("look", "sets of effects in the linear system")

@@ -168,10 +168,9 @@ def select(white: Whitened, blocks: Blocks, most: int = 12, margin: float = 10.0
     - `most`: largest number of blocks.
     - `margin`: amount that a block must explain beyond log(samples) for each of its columns.
     """
-    x, score, price = white.signatures, white.score(), float(np.log(white.count))
-    grouped = [(places, columns, _inner(x, columns)) for places, columns in by_width(blocks)]
-    taken = np.zeros((len(x), 0), x.dtype)
-    residual = white.residual.astype(x.dtype)
+    score, price = white.score(), float(np.log(white.count))
+    grouped = [(places, columns, white.within(columns)) for places, columns in by_width(blocks)]
+    residual, taken = white.residual, np.zeros((len(white.residual), 0))
     chosen: list[int] = []
     for _ in range(most):
         gain = np.full(len(blocks), -np.inf)
@@ -183,23 +182,15 @@ def select(white: Whitened, blocks: Blocks, most: int = 12, margin: float = 10.0
         if not gain[best] > margin:
             break
         chosen.append(best)
-        own = x[:, list(blocks[best])]
+        own = white.columns(blocks[best])
         # OpenBLAS reports invalid operations on some finite arrays (numpy issue 24067).
         with np.errstate(invalid="ignore"):
             own = strong_directions(own - taken @ (taken.T @ own))
         taken = np.concatenate([taken, own], axis=1)
-        across = own.T @ x
+        across = white.products(own)
         score = score - (own.T @ residual) @ across
         residual = residual - own @ (own.T @ residual)
         for _, columns, inner in grouped:
             part = across[:, columns]
             inner -= np.einsum("kbi,kbj->bij", part, part)
     return chosen
-
-
-def _inner(
-    x: Float[np.ndarray, "rows columns"], columns: np.ndarray
-) -> Float[np.ndarray, "blocks width width"]:
-    """Products within each block."""
-    rows = x[:, columns.ravel()].T.reshape(*columns.shape, len(x))
-    return (rows @ rows.transpose(0, 2, 1)).astype(float)

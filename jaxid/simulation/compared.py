@@ -4,13 +4,13 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..compiling import compiled
 from ..signals.smoothing import Band
 
 Moving = Bool[Any, "recordings rows joints"] | None
-# Columns that are filtered at once: few enough for their transforms to fit into the caches.
+# Series that are filtered at once: few enough for their transforms to fit into the caches.
 _WIDTHS = 8, 32
 
 
@@ -50,24 +50,30 @@ def compared_table(
     """
     if band is None and moving is None:
         return np.where(np.asarray(mask)[..., None, None], x, x.dtype.type(0))
-    count = x.shape[-1]
-    width = next((w for w in _WIDTHS if count <= w), _WIDTHS[-1])
-    found = []
-    for first in range(0, count, width):
-        some = x[..., first : first + width]
-        some = np.pad(some, [(0, 0)] * 3 + [(0, width - some.shape[-1])])
-        found.append(np.asarray(_columns(band, moving, mask, jnp.asarray(some))))
-    if not found:
-        rows = np.shape(mask if band is None else band.keep)
-        return np.zeros((*rows, *x.shape[2:]), x.dtype)
-    return np.concatenate(found, axis=-1)[..., :count]
+    joints = x.shape[2] if moving is None else moving.shape[2]
+    series = x.reshape(*x.shape[:2], x.shape[2] * x.shape[3])
+    # Most effects act on one joint, so most series are zero.
+    filled = np.flatnonzero(series.any(axis=(0, 1)))
+    rows = np.shape(mask if band is None else band.keep)
+    found = np.zeros((*rows, series.shape[2]), x.dtype)
+    width = next((w for w in _WIDTHS if len(filled) <= w), _WIDTHS[-1])
+    for first in range(0, len(filled), width):
+        own = filled[first : first + width]
+        some = np.pad(series[..., own], [(0, 0)] * 2 + [(0, width - len(own))])
+        joint = np.resize(own // x.shape[3] % joints, width)
+        passed = _series(band, moving, mask, jnp.asarray(joint), jnp.asarray(some))
+        found[..., own] = np.asarray(passed)[..., : len(own)]
+    return found.reshape(*rows, *x.shape[2:])
 
 
 @compiled
-def _columns(
+def _series(
     band: Band | None,
     moving: Moving,
     mask: Bool[Any, "recordings samples"],
-    x: Float[Array, "recordings samples outputs columns"],
-) -> Float[Array, "recordings rows outputs columns"]:
-    return compared_part(band, moving, jnp.where(mask[..., None, None], x, 0.0))
+    joint: Int[Array, " series"],
+    x: Float[Array, "recordings samples series"],
+) -> Float[Array, "recordings rows series"]:
+    """The compared part of series of any joints."""
+    there = None if moving is None else moving[:, :, joint]
+    return compared_part(band, there, jnp.where(mask[..., None], x, 0.0))
