@@ -6,22 +6,26 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constr
 REQUIREMENTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types check docs dist clean
+.PHONY: help demo test test-all lint types check docs dist clean
 
 help:
-	@echo "make demo    the story on bundled recordings"
-	@echo "make test    all tests"
-	@echo "make lint    ruff"
-	@echo "make types   pyright"
-	@echo "make check   test, lint and types"
-	@echo "make docs    the documentation, in site/"
-	@echo "make dist    wheel and sdist, in dist/"
-	@echo "make clean   remove the virtual environment and caches"
+	@echo "make demo      the story on bundled recordings"
+	@echo "make test      the tests, without the slow ones"
+	@echo "make test-all  all tests: also whole searches and notebooks"
+	@echo "make lint      ruff"
+	@echo "make types     pyright"
+	@echo "make check     test, lint and types"
+	@echo "make docs      the documentation, in site/"
+	@echo "make dist      wheel and sdist, in dist/"
+	@echo "make clean     remove the virtual environment and caches"
 
 demo: .venv/.installed
 	$(BIN)/jaxid demo
 
 test: .venv/.installed-dev
+	$(BIN)/python -m pytest $(PYTEST_ARGS) -m "not slow"
+
+test-all: .venv/.installed-dev
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 lint: .venv/.installed-dev

@@ -46,6 +46,7 @@ def test_loops_with_a_sampled_law_are_searched_along_the_recorded_motion():
 OFFSET = fx.TorqueOffset(joint=1, torque=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("substeps", "law", "why"),
     [
@@ -67,6 +68,7 @@ def test_a_search_continues_along_the_recorded_motion_after_the_first_fit(subste
     assert any("in the simulated loop the error" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_a_search_that_has_made_all_drives_late_begins_again_without_the_law(monkeypatch, tmp_path):
     # As if other effects explained what the delays leave in the first fit.
     monkeypatch.setattr(started, "sampled", lambda *_: "")
@@ -153,6 +155,7 @@ def moving() -> jaxid.Recordings:
     return jaxid.Recordings.of(jaxid.Recording.from_arrays(time, q, q, q_ref=q, name="sines"))
 
 
+@pytest.mark.slow
 def test_the_note_has_the_errors_of_the_simulated_loop():
     loop = jaxid.serial(four_joints(), LAW)
     asked = moving()[0]

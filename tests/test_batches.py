@@ -73,6 +73,7 @@ def agree(found, expected):
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [drive, soft])
 def test_derivatives_of_many_joints_are_those_of_the_run(make):
     case = Prepared(make())
@@ -92,6 +93,7 @@ def test_derivatives_of_many_joints_are_those_of_the_run(make):
     agree(found.end_slopes @ weights, slopes[1])
 
 
+@pytest.mark.slow
 def test_the_linear_system_of_many_joints_is_that_of_the_run():
     case = Prepared(drive())
     p = len(case.loop.theta)

@@ -24,7 +24,6 @@ def _quick(name: str, folder: Path, *more: str) -> Any:
     return json.loads(file.read_text())
 
 
-@pytest.mark.slow
 def test_peers_simulate_and_differentiate_the_same_loop(tmp_path):
     """Different programs of the same steps agree to rounding, an adaptive solver to its own."""
     rows = _quick("peers", tmp_path)
@@ -64,14 +63,12 @@ def test_minimisers_and_gradients_agree_as_far_as_each_can(tmp_path):
     assert errors["three-point differences"] < 1e-6
 
 
-@pytest.mark.slow
 def test_scaling_covers_recordings_lengths_parameters_and_hypotheses(tmp_path):
     rows = _quick("scaling", tmp_path)
     assert {row["grows"] for row in rows} == {"recordings", "length", "parameters", "hypotheses"}
     assert all(row["us_per_step"] > 0 for row in rows)
 
 
-@pytest.mark.slow
 def test_own_effects_are_timed_against_the_loop_without_them(tmp_path):
     rows = {row["effect"]: row for row in _quick("own_effects", tmp_path)}
     assert rows.keys() == {"none", "solve 6", "network 16", "eigh"}
@@ -79,7 +76,6 @@ def test_own_effects_are_timed_against_the_loop_without_them(tmp_path):
     assert rows["none"]["simulation_times"] == 1
 
 
-@pytest.mark.slow
 def test_memory_is_measured_by_length(tmp_path):
     rows = _quick("memory", tmp_path)
     assert all(row["succeeded"] and row["peak_MiB"] > 0 for row in rows)
@@ -96,7 +92,6 @@ def test_time_and_memory_are_measured_by_joints(tmp_path):
         assert row["first_s"] > row["again_s"] > 0
 
 
-@pytest.mark.slow
 def test_a_mistake_in_recordings_is_named_and_gives_no_sure_verdict(tmp_path):
     rows = _quick("mistakes", tmp_path)
     assert [(row["verdict"], row["named"]) for row in rows] == [("undetermined", True)] * 2
@@ -110,7 +105,6 @@ def test_settings_of_the_process_are_each_taken_away(tmp_path):
     assert rows["Jacobian", "as jaxid sets them"]["run"] == 1
 
 
-@pytest.mark.slow
 def test_a_body_at_the_tip_of_six_joints_is_found(tmp_path):
     pytest.importorskip("mujoco")
     pytest.importorskip("example_robot_data")
@@ -121,7 +115,6 @@ def test_a_body_at_the_tip_of_six_joints_is_found(tmp_path):
     assert found == pytest.approx(case["numbers"]["mass"], rel=0.03)
 
 
-@pytest.mark.slow
 def test_worlds_are_simulated_by_mujoco_and_judged(tmp_path):
     pytest.importorskip("mujoco")
     lines = tmp_path / "lines.jsonl"
@@ -309,7 +302,6 @@ def test_a_world_whose_effect_does_not_act_is_drawn_again():
         cases._hidden(rng, wanted, robot, (friction,), one, 1.0, run, one)
 
 
-@pytest.mark.slow
 def test_baselines_answer_on_the_recordings_of_the_worlds(tmp_path):
     for module in ("mujoco", "pinocchio", "pysindy", "gplearn", "sklearn"):
         pytest.importorskip(module)
@@ -389,7 +381,6 @@ def test_a_fleet_has_one_table_however_it_is_run(tmp_path):
         assert row["numbers_apart"] < 1e-4, row
 
 
-@pytest.mark.slow
 @pytest.mark.shared
 def test_a_measured_servo_is_simulated_from_its_first_sample(tmp_path, shared_data):
     """The errors that the recordings' own README gives, fitted on that same error, in mrad."""

@@ -215,7 +215,6 @@ def square(k: int) -> int:
     return k * k
 
 
-@pytest.mark.slow
 def test_a_worker_that_dies_takes_no_other_piece_down(tmp_path: Path) -> None:
     pieces = {f"{k}": k for k in (2, 4, 13)}
     with Campaign(tmp_path / "c", {}) as campaign:

@@ -135,6 +135,7 @@ def test_effect_given_as_an_object_is_screened(offset_story):
     assert not isinstance(diagnosis.best, Curve)
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group("offset")
 def test_next_experiment_knows_a_band():
     """With the law unknown fewer rows are compared than a reference has samples."""

@@ -89,7 +89,6 @@ def told() -> Told:
     )
 
 
-@pytest.mark.slow
 def test_it_finds_the_hidden_effect_and_ends_well() -> None:
     run = told()
     assert run.exit_code == 0
@@ -101,7 +100,6 @@ def test_it_finds_the_hidden_effect_and_ends_well() -> None:
     assert first["parameters"]["velocity"]["value"] == pytest.approx(0.4, rel=0.1)
 
 
-@pytest.mark.slow
 def test_the_error_on_unseen_recordings_falls_to_the_noise() -> None:
     errors = told().json["error_percent"]
     before, after = errors["before"]["validate"], errors["after"]["validate"]
@@ -110,7 +108,6 @@ def test_the_error_on_unseen_recordings_falls_to_the_noise() -> None:
     assert all(x < 1.2 * f for x, f in zip(after, floor, strict=True))
 
 
-@pytest.mark.slow
 def test_the_json_has_the_fields_of_its_page() -> None:
     found = told().json
     assert found["robot"] == "scara"
@@ -133,8 +130,6 @@ def test_the_json_has_the_fields_of_its_page() -> None:
     assert len(found["noise_floor_percent"]) == 2
 
 
-@pytest.mark.slow
-@pytest.mark.slow
 def test_an_effect_of_the_users_is_asked_beside_the_known_ones(tmp_path: Path) -> None:
     asked: list[Any] = []
     # Before the command is patched, which tells the story.
@@ -155,7 +150,6 @@ def test_an_effect_of_the_users_is_asked_beside_the_known_ones(tmp_path: Path) -
     assert asked[-1].effect_name() == "hose"
 
 
-@pytest.mark.slow
 def test_what_is_asked_and_the_exit_code_follow_the_options() -> None:
     asked: dict[str, Any] = {}
     story = dataclasses.replace(told().story, verdict="undetermined", reason="of a test")
@@ -179,7 +173,6 @@ def test_what_is_asked_and_the_exit_code_follow_the_options() -> None:
     assert "no effect 'stribec'" in run.stderr
 
 
-@pytest.mark.slow
 def test_the_saved_model_can_be_held_against_recordings(tmp_path: Path) -> None:
     run = told()
     command = ["compare", HIDDEN[2], "--fit", str(run.saved), "--json", str(tmp_path / "e.json")]
@@ -191,7 +184,6 @@ def test_the_saved_model_can_be_held_against_recordings(tmp_path: Path) -> None:
     assert next(iter(written["error_percent"].values())) == pytest.approx(expected)
 
 
-@pytest.mark.slow
 def test_a_saved_effect_of_the_users_is_found_in_its_file(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(HOSE, encoding="utf-8")
     given = str(tmp_path / "own.py") + ":Hose"
@@ -206,12 +198,10 @@ def test_a_saved_effect_of_the_users_is_found_in_its_file(tmp_path: Path) -> Non
     assert result.exit_code == 0
 
 
-@pytest.mark.slow
 def test_several_held_out_files_follow_one_option() -> None:
     assert told().story.steps[0].held_out.recordings.names == ("held_out", "other_day")
 
 
-@pytest.mark.slow
 def test_report_and_journal_are_written() -> None:
     assert told().page.stat().st_size > 2**20
     assert (told().journal / "plan.json").exists()

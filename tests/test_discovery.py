@@ -159,6 +159,7 @@ def test_a_discovery_compares_what_the_loop_is_judged_by():
             jaxid.discover(jaxid.scara(), record, method=jaxid.OEM(output=output), progress=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [f"case_{k:02d}" for k in range(1, 9)])
 def test_hidden_effects(shared_file, case):
     """The eight published cases: verdict, effects and joints, error on the held-out recording."""

@@ -54,7 +54,6 @@ class Loaded(HTMLParser):
             self.addresses += [a for a in [given.get(fetched[tag])] if a]
 
 
-@pytest.mark.slow
 def test_it_builds_and_fetches_nothing_from_elsewhere(site: Path) -> None:
     pages = sorted(site.rglob("*.html"))
     assert len(pages) > 15
@@ -66,7 +65,6 @@ def test_it_builds_and_fetches_nothing_from_elsewhere(site: Path) -> None:
             assert local.exists() or page.name == "404.html", f"{page.name} lacks {address}"
 
 
-@pytest.mark.slow
 def test_equations_are_drawn_without_a_script(site: Path) -> None:
     text = (site / "method.html").read_text(encoding="utf-8")
     assert text.count("<math") > 15
@@ -74,7 +72,6 @@ def test_equations_are_drawn_without_a_script(site: Path) -> None:
     assert "\\" not in "".join(re.findall(r"<math.*?</math>", text, flags=re.DOTALL))
 
 
-@pytest.mark.slow
 def test_the_api_shows_what_daily_names_do(site: Path) -> None:
     pages = "".join(p.read_text(encoding="utf-8") for p in (site / "api").glob("*.html"))
     shown = set(re.findall(r'id="(jaxid[\w.]+)"', pages))

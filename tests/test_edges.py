@@ -206,6 +206,7 @@ def test_light_and_heavy_robots_are_fitted_alike(
     assert np.all(np.abs(fit.theta / mass - plain.theta) < away * plain.std)
 
 
+@pytest.mark.slow
 def test_friction_as_steep_as_a_step(case: Any, plain: jaxid.Fit) -> None:
     loop = jaxid.scara().with_values(eps1=1e-5, eps2=1e-5)
     fit = jaxid.fit(loop, pair(case), QUIET)
@@ -245,6 +246,7 @@ def test_references_in_a_wrong_unit_are_said(case: Any, scale: float) -> None:
     sound(fit)
 
 
+@pytest.mark.slow
 def test_what_explains_nothing_is_undetermined(case: Any) -> None:
     wrong = [record(case, n, tau=1e6 * case.recordings[n]["tau"]) for n in ("fit_1", "fit_2")]
     found = jaxid.discover(jaxid.scara(), wrong, progress=False)

@@ -279,7 +279,6 @@ def test_lines_are_counted_as_an_editor_does(tmp_path):
         jaxid.read(path)
 
 
-@pytest.mark.slow
 def test_diagnose_ranks_what_the_bundled_arm_lacks(tmp_path):
     out = tmp_path / "ranking.json"
     found = run("diagnose", FIT_1, FIT_2, "--robot", "scara", "--json", out)

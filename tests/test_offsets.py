@@ -43,6 +43,7 @@ def values(found) -> np.ndarray:
     return np.full(len(found.system.loop.theta), 1e-3)
 
 
+@pytest.mark.slow
 def test_friction_by_direction_replaces_an_offset_that_absorbed_it():
     seen = predictor([biased(1, True), biased(2, True)], axis(EPS))
     (found,) = instead_of_offsets(seen, values(seen))
@@ -60,6 +61,7 @@ def test_friction_by_direction_replaces_an_offset_that_absorbed_it():
     assert instead_of_offsets(held, values(held)) == []
 
 
+@pytest.mark.slow
 def test_a_viscous_part_that_explains_its_price_is_estimated():
     runs = [biased(seed, True, viscous=1.5) for seed in (1, 2)]
     seen = predictor(runs, axis(EPS))
@@ -129,7 +131,6 @@ def test_friction_by_direction_is_named_and_an_offset_is_not():
     assert not any("offset" in note for note in constant.notes)
 
 
-@pytest.mark.slow
 def test_where_noise_hides_the_difference_both_have_a_weight():
     found = searched(True, noise=2.0)
     assert found.verdict == "undetermined"

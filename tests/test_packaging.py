@@ -18,8 +18,6 @@ from typer.testing import CliRunner
 import jaxid
 from jaxid.cli import app
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:

@@ -17,7 +17,7 @@ from jaxid.cli import app
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
 # What one worker has fitted serves all of them.
-pytestmark = [pytest.mark.xdist_group("demo"), pytest.mark.slow]
+pytestmark = pytest.mark.xdist_group("demo")
 
 DRAWN = """() => [...document.querySelectorAll("[data-figure]")].filter(
     (box) => box.offsetParent !== null).every(

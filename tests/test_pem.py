@@ -153,6 +153,7 @@ def test_the_papers_formula_has_one_ratio_for_all_parameters(fits, recording):
     assert np.allclose(shown.std, jaxid.deviations(fits["sep"])["paper"])
 
 
+@pytest.mark.slow
 def test_bootstrap_spreads_as_the_deviations_say(fits):
     found = jaxid.bootstrap(fits["sep"], 64, seed=1)
     assert found.settled.all()

@@ -98,7 +98,6 @@ def test_fits_from_bodies_half_wrong_leave_the_error_of_free_base_parameters():
         assert smallest_eigenvalues(np.asarray(fit.loop.arm.inertias())).min() > 0
 
 
-@pytest.mark.slow
 def test_deviations_hold_for_bodies_as_uncertain_as_declared():
     """Also in base parameters, where they follow by linearisation."""
     arm = loop().arm

@@ -145,6 +145,7 @@ def test_pendulum_beats_the_authors_on_an_unseen_recording(pendulum, pendulum_fi
     assert ours["joint 1"] < 1.02 * theirs["joint 1"]
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group("pendulum")
 def test_pendulum_in_the_open_follows_an_unseen_recording(pendulum, pendulum_fits):
     fitting, unseen = pendulum

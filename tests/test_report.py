@@ -52,7 +52,6 @@ def page() -> Page:
     return Page(told().page.read_text(encoding="utf-8"))
 
 
-@pytest.mark.slow
 def test_it_loads_nothing(page: Page) -> None:
     loading = ("src", "srcset", "data", "poster", "action", "background")
     assert [e for e in page.elements if any(name in e[1] for name in loading)] == []
@@ -68,7 +67,6 @@ def test_it_loads_nothing(page: Page) -> None:
     assert any(policy.startswith("default-src 'none'") for policy in policies if policy)
 
 
-@pytest.mark.slow
 def test_it_is_small_and_holds_plotly_once(page: Page) -> None:
     assert sum(len(code) > 2**20 for code in page.code) == 1
     assert told().page.stat().st_size - max(map(len, page.code)) < 2**20
@@ -89,7 +87,6 @@ def test_signals_of_six_joints_are_small() -> None:
     assert drawn < 0.7 * 2**20
 
 
-@pytest.mark.slow
 def test_the_verdict_comes_first(page: Page) -> None:
     text = " ".join(page.shown).replace("\u00a0", " ")
     headline = told().story.headline
@@ -132,7 +129,6 @@ def _renamed(story: jaxid.Discovery) -> jaxid.Discovery:
     return dataclasses.replace(story, steps=steps, removed=removed, notes=(HOSTILE, IMAGE))
 
 
-@pytest.mark.slow
 def test_names_are_shown_and_not_obeyed(tmp_path: Path) -> None:
     path = write_report(_renamed(told().story), tmp_path / "hostile.html")
     text = path.read_text(encoding="utf-8")
@@ -144,14 +140,12 @@ def test_names_are_shown_and_not_obeyed(tmp_path: Path) -> None:
     assert not any(key.startswith("on") for _, attributes in page.elements for key in attributes)
 
 
-@pytest.mark.slow
 def test_a_story_writes_its_own_page(tmp_path: Path) -> None:
     assert jaxid.write_report(told().story, tmp_path / "story.html").stat().st_size > 2**20
     with pytest.raises(ModelError, match="there is no folder"):
         jaxid.write_report(told().story, tmp_path / "absent" / "story.html")
 
 
-@pytest.mark.slow
 def test_a_story_of_one_step_is_a_page_too(tmp_path: Path) -> None:
     story = told().story
     short = dataclasses.replace(story, verdict="adequate", steps=story.steps[:1])
@@ -159,7 +153,6 @@ def test_a_story_of_one_step_is_a_page_too(tmp_path: Path) -> None:
     assert "nothing is missing" in " ".join(page.shown)
 
 
-@pytest.mark.slow
 def test_what_cannot_be_told_is_a_page_that_says_why(tmp_path: Path) -> None:
     why = "the fit of the model did not converge (a test)"
     story = dataclasses.replace(
@@ -190,7 +183,6 @@ def test_deviations_end_where_their_value_does() -> None:
     assert with_deviation(2.0, None) == "2"
 
 
-@pytest.mark.slow
 def test_a_shift_is_counted_in_deviations(page: Page) -> None:
     first, last = told().story.steps[0].fit, told().story.fit
     k, j = first.names.index("Fc2"), last.names.index("Fc2")
@@ -200,7 +192,6 @@ def test_a_shift_is_counted_in_deviations(page: Page) -> None:
     assert abs(shift) > 3
 
 
-@pytest.mark.slow
 def test_every_error_is_beside_its_floor(page: Page) -> None:
     story = told().story
     text = " ".join(page.shown)
@@ -210,7 +201,6 @@ def test_every_error_is_beside_its_floor(page: Page) -> None:
     assert all(f"{x:.2f}" in text for x in story.noise_floor_percent())
 
 
-@pytest.mark.slow
 def test_a_reference_is_shown_only_where_effects_look_alike(tmp_path: Path) -> None:
     story = told().story
     rival = next(v.key for v in story.first_diagnosis.ranking[1:] if v.possible)

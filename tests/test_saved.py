@@ -50,7 +50,6 @@ def again(value: Any, classes: tuple[type, ...] = ()) -> Any:
     return archive.unpack(archive.pack(value), "here", saved.registry(classes))
 
 
-@pytest.mark.slow
 def test_a_story_comes_back_to_the_bit(tmp_path: Path) -> None:
     story = told().story
     story.save(tmp_path / "story.jaxid")
@@ -74,7 +73,6 @@ def test_a_story_comes_back_to_the_bit(tmp_path: Path) -> None:
     assert same_bytes
 
 
-@pytest.mark.slow
 def test_a_loaded_fit_works_as_before(tmp_path: Path) -> None:
     fit = told().story.fit
     fit.save(tmp_path / "fit.jaxid")
@@ -89,7 +87,6 @@ def test_a_loaded_fit_works_as_before(tmp_path: Path) -> None:
     same(told().story.diagnosis.table(), jaxid.load(tmp_path / "diagnosis.jaxid").table())
 
 
-@pytest.mark.slow
 def test_a_loaded_story_writes_the_same_page(tmp_path: Path) -> None:
     story = told().story
     texts = [

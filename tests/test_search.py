@@ -276,6 +276,7 @@ def test_effects_without_a_determined_value_are_left_to_a_curve(
     assert bool(search.failures) == replaced
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group("offset")
 def test_an_amplitude_at_its_bound_does_not_exclude_an_effect(offset_case):
     """Noise makes one of the two drags negative."""
@@ -306,6 +307,7 @@ def test_amplitudes_within_bounds_are_those_of_scipy():
     assert bounded_amplitudes(gram, np.full(3, -1.0), size, limits)[1] == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group("offset")
 def test_what_is_not_worth_knowing_is_not_added(offset_case, offset_story):
     fit, held_out = recordings_of(offset_case)

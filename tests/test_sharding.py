@@ -74,7 +74,6 @@ def test_two_processes_on_loopback_return_the_estimate_of_one(alone):
         _close(found, alone)
 
 
-@pytest.mark.slow
 def test_devices_of_one_host_share_recordings_that_do_not_divide_evenly(alone):
     """Three recordings on two devices."""
     found = _result(_start(0, 1, 0, devices=2))

@@ -60,6 +60,7 @@ def record():
     return jaxid.Recording(run.time, run.q, run.tau, q_ref=run.q_ref)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("between", [(), (SHAFT,), (WORN,)], ids=["rigid", "elastic", "worn"])
 def test_signature_is_the_derivative_of_a_simulation(record, between):
     """What acts on a link acts there also behind a transmission; what loads it, as a load."""

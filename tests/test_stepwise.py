@@ -26,6 +26,7 @@ def recordings(*effects: tuple[str, int | None]) -> jaxid.Recordings:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "joint"),
     [

@@ -51,7 +51,6 @@ def test_what_one_stretch_shows_is_not_believed():
     assert added == [["thermal_drift"], []]
 
 
-@pytest.mark.slow
 def test_a_stop_may_be_touched_once():
     """Without its only contact its stiffness is unknown, but a stop is no error of one stretch."""
     stiffness, angle = 400.0, 0.095

@@ -113,6 +113,7 @@ def test_workspace_is_of_all_joints(loop):
     assert float(bad.smallest_inertia()) < 0
 
 
+@pytest.mark.slow
 def test_masses_are_found_with_the_missing_spring_named(loop, recordings):
     fit = jaxid.fit(loop, recordings, jaxid.OEM(start="given", progress=False))
     # Elasticity and backlash on three joints are programs that take half a minute to compile.

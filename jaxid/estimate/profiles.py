@@ -171,11 +171,3 @@ def _loss_and_variance(optimum) -> tuple[float, float]:
     loss = sum(float(np.sum(r**2)) for r in reduced.residuals)
     rows = float(sum(np.sum(f) for f in reduced.filled()))
     return loss, loss / (rows - float(np.sum(reduced.spent)))
-
-
-def profile_table(profiles: dict[str, Profile], level: float = 0.95) -> "pd.DataFrame":
-    """Intervals of several profiles, one row each."""
-    import pandas as pd
-
-    rows = {name: found.interval(level) for name, found in profiles.items()}
-    return pd.DataFrame(rows, index=["low", "high"]).T.rename_axis("parameter")
