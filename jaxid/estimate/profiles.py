@@ -17,7 +17,6 @@ from .refit import Lanes, refit
 from .result import Fit
 
 if TYPE_CHECKING:
-    import pandas as pd
     import plotly.graph_objects as go
 
 # Points in deviations: dense enough for a cubic, wide enough for intervals of 99.7 %.
