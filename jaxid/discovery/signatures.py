@@ -233,8 +233,9 @@ def _responses(
         for portion in portions:
             push, noise, rate = _all_forces(portion, alone.motion, remaining)
             last = first + push.shape[-1]
-            table = np.array(respond(alone, "push", push))
+            table = np.asarray(respond(alone, "push", push))
             own, linked = (c[(c >= first) & (c < last)] - first for c in (reading, behind))
+            table = table.copy() if len(own) or len(linked) else table
             if len(own):
                 table[..., own] += respond(alone, "noise", noise)
                 table[..., own] += respond(alone, "rate", rate)
