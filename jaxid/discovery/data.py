@@ -117,7 +117,7 @@ class Data(eqx.Module):
         """The whitened signatures of one output, and the numbers of those that are not zero."""
         own = self.table[:, :, output]
         columns = np.flatnonzero(own.any(axis=(0, 1)))
-        white = whitened(own[:, :, None, columns], [noise], self.mask)
+        white = whitened(own.take(columns, axis=2)[:, :, None], [noise], self.mask)
         if self.level is not None:
             white /= self.level[:, output, None, None, None].astype(white.dtype)
         return white.reshape(-1, len(columns)), columns

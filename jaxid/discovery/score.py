@@ -74,7 +74,7 @@ class Whitened(eqx.Module):
         unknown = len(data.mask) * sum(f.order for f in noise)
         rows = data.mask.sum() * data.residual.shape[2] + len(data.known_left())
         count = rows - unknown - basis.shape[1]
-        across = _products(parts, basis, len(size))
+        across = _products(parts, basis.astype(data.table.dtype), len(size))
         return cls(r, parts, basis, across, size, float(count))
 
     def columns(self, numbers: Sequence[int]) -> Float[np.ndarray, "rows some"]:
@@ -87,8 +87,9 @@ class Whitened(eqx.Module):
         return found
 
     def products(self, x: Float[np.ndarray, "rows some"]) -> Float[np.ndarray, "some columns"]:
-        """Products of columns with the signatures."""
-        return _products(self.parts, x, len(self.size)) - (x.T @ self.basis) @ self.across
+        """Products of columns with the signatures, in single precision."""
+        single = x.astype(self.parts[0].values.dtype)
+        return _products(self.parts, single, len(self.size)) - (x.T @ self.basis) @ self.across
 
     def within(self, blocks: Int[np.ndarray, "blocks width"]) -> Float[np.ndarray, "blocks w w"]:
         """Products of the signatures of each block with each other."""
@@ -120,7 +121,7 @@ class Whitened(eqx.Module):
         for j, part in enumerate(self.parts):
             drawn = rng.standard_normal((len(part.values), draws), np.float32)
             found[part.columns] += part.values.T @ drawn
-            along += _rows(self.basis, j, self.parts).T @ drawn
+            along += _rows(self.basis, j, self.parts).T.astype(np.float32) @ drawn
         return found - self.across.T @ along
 
     def score(self) -> Float[np.ndarray, " columns"]:
@@ -153,10 +154,11 @@ def _rows(x: np.ndarray, part: int, parts: Sequence[Part]) -> np.ndarray:
 def _products(
     parts: Sequence[Part], x: Float[np.ndarray, "rows some"], columns: int
 ) -> Float[np.ndarray, "some columns"]:
-    """Products of columns with all parts, before any projection."""
+    """Products of columns with all parts, in the precision of the columns."""
     found = np.zeros((x.shape[1], columns))
     for j, part in enumerate(parts):
-        found[:, part.columns] += _rows(x, j, parts).T @ part.values.astype(float)
+        values = part.values.astype(x.dtype, copy=False)
+        found[:, part.columns] += _rows(x, j, parts).T @ values
     return found
 
 
