@@ -34,7 +34,6 @@ def test_peers_simulate_and_differentiate_the_same_loop(tmp_path):
     assert {"simulation", "Jacobian", "whole fit"} == {row["task"] for row in rows}
 
 
-@pytest.mark.slow
 def test_minimisers_and_gradients_agree_as_far_as_each_can(tmp_path):
     rows = _quick("gradients", tmp_path)
     fits = {row["minimiser"]: row for row in rows if row["task"] == "fit"}
@@ -82,7 +81,6 @@ def test_memory_is_measured_by_length(tmp_path):
     assert len(rows) > 1
 
 
-@pytest.mark.slow
 def test_time_and_memory_are_measured_by_joints(tmp_path):
     rows = {row["task"]: row for row in _quick("joints", tmp_path)}
     assert list(rows) == ["simulation", "Jacobian"]
@@ -97,7 +95,6 @@ def test_a_mistake_in_recordings_is_named_and_gives_no_sure_verdict(tmp_path):
     assert [(row["verdict"], row["named"]) for row in rows] == [("undetermined", True)] * 2
 
 
-@pytest.mark.slow
 def test_settings_of_the_process_are_each_taken_away(tmp_path):
     rows = {(row["task"], row["setting"]): row for row in _quick("process", tmp_path)}
     assert {task for task, _ in rows} == {"simulation", "Jacobian", "whole fit"}
@@ -361,7 +358,6 @@ def test_load_is_what_moves_the_link_and_library_names_what_it_is_given():
     assert np.sqrt(np.mean(error[100:-100] ** 2)) < 0.02 * np.std(expected)
 
 
-@pytest.mark.slow
 def test_a_fleet_has_one_table_however_it_is_run(tmp_path):
     """In processes, by Dask where it is installed, and killed and resumed; one robot is broken."""
     rows = _quick("fleet", tmp_path)
