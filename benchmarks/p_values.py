@@ -1,9 +1,10 @@
 """Distribution of p-values on clean recordings.
 
-python -m benchmarks.p_values [--seed N] [--quick] [--json FILE] [--jobs 2]
+python -m benchmarks.p_values [--seed N] [--law known|unknown] [--quick] [--json FILE] [--jobs 2]
 
 A robot's motions are simulated once and its noise is drawn several times. If no effect is missing,
-the smallest corrected p-value of a diagnosis should be uniform between 0 and 1.
+the smallest corrected p-value of a diagnosis should be uniform between 0 and 1. If the law is
+unknown, torque is compared along the recorded motion.
 """
 
 import argparse
@@ -33,20 +34,22 @@ QUANTILES = (0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9)
 
 @dataclass(frozen=True)
 class Robot:
-    """One robot with its motions, one colour of noise, and the number of draws."""
+    """One robot with its motions, one colour of noise, the number of draws, and what is known."""
 
     seed: int
     colour: str
     draws: int
+    law: str
 
 
-def draw_robots(master: int, quick: bool = False) -> list[Robot]:
+def draw_robots(master: int, law: str, quick: bool = False) -> list[Robot]:
     """Robots, with the colours of noise in turn."""
     rng = np.random.default_rng(master)
     robots, draws = (5, 2) if quick else (25, 8)
     seeds = rng.integers(1, 2**31, robots).tolist()
     first = int(rng.integers(len(COLOURS)))
-    return [Robot(s, COLOURS[(first + k) % len(COLOURS)], draws) for k, s in enumerate(seeds)]
+    colours = [COLOURS[(first + k) % len(COLOURS)] for k in range(robots)]
+    return [Robot(s, c, draws, law) for s, c in zip(seeds, colours, strict=True)]
 
 
 def pairs(robot: Robot) -> list[jaxid.Recordings]:
@@ -69,6 +72,8 @@ def pairs(robot: Robot) -> list[jaxid.Recordings]:
 def judge_robot(robot: Robot) -> list[dict[str, Any]]:
     """The smallest p-value of each pair's diagnosis, with its hypothesis."""
     rows, loop = [], jaxid.scara()
+    if robot.law == "unknown":
+        loop = jaxid.scara(jaxid.control.Tracking())
     for number, recordings in enumerate(pairs(robot)):
         started = time.perf_counter()
         start = "auto" if number == 0 else "given"
@@ -87,6 +92,11 @@ def judge_robot(robot: Robot) -> list[dict[str, Any]]:
                 "joint": least.hypothesis.joint,
                 "ranking_p": min(v.p_value for v in diagnosis.ranking),
                 "curves_p": min(v.p_value for v in diagnosis.where),
+                "others_p": min(
+                    v.p_value
+                    for v in (*diagnosis.ranking, *diagnosis.where)
+                    if not isinstance(v.hypothesis.effect, jaxid.effects.AbstractTransmission)
+                ),
                 "adequate": diagnosis.adequate,
                 "seconds": time.perf_counter() - started,
             }
@@ -110,6 +120,7 @@ def summary(table: pd.DataFrame) -> dict[str, Any]:
         },
         "below_0.05_ranking_percent": 100 * float(np.mean(table["ranking_p"] < 0.05)),
         "below_0.05_curves_percent": 100 * float(np.mean(table["curves_p"] < 0.05)),
+        "below_0.05_without_transmissions_percent": 100 * float(np.mean(table["others_p"] < 0.05)),
         "worst": table.nsmallest(8, "p").to_dict(orient="records"),
     }
 
@@ -124,7 +135,8 @@ def show_summary(result: dict[str, Any]) -> None:
     print(f"by colour, %: {result['below_0.05_by_colour']}")
     print(
         f"effects alone {result['below_0.05_ranking_percent']:.1f} %, "
-        f"curves alone {result['below_0.05_curves_percent']:.1f} %"
+        f"curves alone {result['below_0.05_curves_percent']:.1f} %, all without transmissions "
+        f"{result['below_0.05_without_transmissions_percent']:.1f} %"
     )
     for should, is_ in result["quantiles"].items():
         print(f"quantile {should:5s} {is_:.4f}")
@@ -139,13 +151,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the bench; see the module's first lines."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, help="of everything; drawn anew if not given")
+    parser.add_argument("--law", choices=("known", "unknown"), default="known")
     parser.add_argument("--quick", action="store_true", help="ten pairs")
     parser.add_argument("--json", type=Path, help="file for all results")
     parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args(arguments)
     seed = secrets.randbits(31) if given.seed is None else given.seed
-    robots = draw_robots(seed, given.quick)
-    print(f"seed {seed}, {sum(r.draws for r in robots)} pairs", flush=True)
+    robots = draw_robots(seed, given.law, given.quick)
+    print(f"seed {seed}, {sum(r.draws for r in robots)} pairs, law {given.law}", flush=True)
     configure_jax()
     rows: list[dict[str, Any]] = []
     spawn = multiprocessing.get_context("spawn")
@@ -157,7 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     result = summary(pd.DataFrame(rows))
     show_summary(result)
     if given.json is not None:
-        content = {"seed": seed, **result, "rows": rows}
+        content = {"seed": seed, "law": given.law, **result, "rows": rows}
         given.json.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 

@@ -98,9 +98,12 @@ def test_open_loop_is_judged_by_position_in_windows(loop, recordings):
     assert np.all(short.error_percent.to_numpy() < long.error_percent.to_numpy())
 
 
-def test_a_fit_brings_its_window(loop, recordings):
+@pytest.mark.parametrize("filtered", [False, True])
+def test_a_fit_brings_its_window(loop, recordings, filtered):
     driven = dataclasses.replace(loop, controller=OpenLoop())
-    fit = jaxid.fit(driven, recordings, jaxid.OEM(window=1.0, start="given"))
+    plain = jaxid.OEM(window=1.0, start="given")
+    method = jaxid.SeparablePEM(plain, orders=(2, 2)) if filtered else plain
+    fit = jaxid.fit(driven, recordings, method)
     own, given = jaxid.compare(fit, recordings), jaxid.compare(fit.loop, recordings, window=1.0)
     assert own.errors.equals(given.errors)
 

@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from stories import Bump
+from test_noise_floor import axis
 
 import jaxid
+from jaxid.control import Tracking
 from jaxid.discovery.hypotheses import _inertia, candidates, survey
-from jaxid.effects import Curve, Motion, RotorInertia, TorqueOffset
+from jaxid.effects import Curve, Motion, QuadraticDrag, RotorInertia, Stribeck, TorqueOffset
 
 
 @pytest.mark.xdist_group("offset")
@@ -99,6 +101,22 @@ def test_the_inertia_of_a_joint_includes_its_rotor():
     np.testing.assert_allclose(whole[1], 1e6, rtol=1e-3)
     np.testing.assert_allclose(whole[0], mass[:, 0, 0].mean(), rtol=0.02)
     assert bare[0] < whole[0]
+
+
+def test_a_short_recording_may_come_first():
+    """Recordings are padded to the length of the longest."""
+    whole, _ = axis(1)
+    few = Stribeck, QuadraticDrag
+    both = [axis(2, name="short")[0].slice(0.0, 4.0), whole]
+    found = [
+        jaxid.diagnose(
+            jaxid.fit(jaxid.robots.emps(Tracking()), pair), catalogue=few, progress=False
+        )
+        for pair in (both, both[::-1])
+    ]
+    rank = "effect", "joint"
+    one, other = (d.table().set_index([*rank])["explained_percent"] for d in found)
+    assert np.allclose(one, other[one.index], rtol=1e-2)
 
 
 def test_a_diagnosis_begins_where_its_fit_did():

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.effects import TorqueOffset
 from jaxid.errors import FitError, RecordingError
+from jaxid.estimate.result import relative_errors
 
 pytestmark = pytest.mark.xdist_group("edges")
 
@@ -148,6 +150,39 @@ def test_a_recording_that_diverges_is_left_out_and_named(case: Any) -> None:
     sound(fit)
     alone = jaxid.fit(loop, record(case, "fit_2"), given)
     assert alone.status is jaxid.Status.diverged
+
+
+def test_a_search_names_recordings_along_which_its_model_diverges(case: Any) -> None:
+    """One is left out of the fits; a held-out one leaves the model untested."""
+    loop = jaxid.scara().add(Runaway(joint=2))
+    unseen = dataclasses.replace(record(case, "held_out"), name="fit_2")
+    given = dataclasses.replace(QUIET, start="given")
+    story = jaxid.discover(
+        loop, pair(case), unseen, method=given, catalogue=[TorqueOffset], progress=False
+    )
+    assert story.verdict == "undetermined"
+    assert "diverges when it is simulated along a held-out recording" in story.reason
+    assert any("fit_2 was left out of all fits" in note for note in story.notes)
+    assert any("diverges when it is simulated along fit_2" in note for note in story.notes)
+
+
+def test_a_held_out_recording_is_checked_before_the_search(
+    case: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = case.recordings["held_out"]
+    without = jaxid.Recording.from_arrays(rows["time"], rows["q"], rows["tau"], name="held_out")
+    monkeypatch.setattr(jaxid.estimate.OEM, "fit", lambda *_: pytest.fail("a fit came first"))
+    with pytest.raises(jaxid.errors.JaxidError, match="held_out"):
+        jaxid.discover(jaxid.scara(), pair(case), without, progress=False)
+
+
+def test_a_joint_that_is_not_compared_in_a_recording_has_no_error() -> None:
+    measured = np.column_stack([np.ones(4), np.zeros(4), np.zeros(4)])
+    left = np.column_stack([0.1 * np.ones(4), np.zeros(4), np.ones(4)])
+    rest = jaxid.Recording(np.arange(4.0), measured, measured, name="a")
+    (row,) = relative_errors([rest], [measured], [left]).to_numpy()
+    assert row[:2] == pytest.approx([10.0, 0.0])
+    assert np.isinf(row[2])
 
 
 def test_time_is_bounded(case: Any, plain: jaxid.Fit) -> None:

@@ -17,6 +17,7 @@ from jaxid.discovery.bounded import bounded_amplitudes
 from jaxid.discovery.data import Data
 from jaxid.discovery.diagnosis import over_recordings
 from jaxid.discovery.explore import Candidate
+from jaxid.discovery.fits import Fits
 from jaxid.discovery.likelihood import price, score, weights
 from jaxid.discovery.loose import undetermined, with_fewer, without_loose
 from jaxid.discovery.models import Model, Visited, probability
@@ -38,6 +39,7 @@ from jaxid.effects import (
 from jaxid.estimate import SeparablePEM
 from jaxid.noise import ARFilter
 from jaxid.parameters import Scalar, parameter
+from jaxid.storage.campaign import Campaign
 
 
 class OffsetAndDrag(AbstractEffect):
@@ -478,3 +480,18 @@ def test_filters_do_not_take_an_error_of_the_model_for_noise(offset_case, offset
     np.testing.assert_allclose(same.theta, filtered.theta, rtol=1e-9)
     again = dataclasses.replace(refits, before=error / 2).filtered(start.loop, noise)
     np.testing.assert_allclose(again.theta, plain.theta, rtol=1e-9)
+
+
+@pytest.mark.xdist_group("offset")
+def test_a_model_that_is_fitted_again_from_other_values_is_another_piece(
+    offset_story, tmp_path, monkeypatch
+):
+    found, asked = offset_story[0].fit, []
+    monkeypatch.setattr(Refits, "filtered", lambda _, loop, noise: asked.append(loop) or found)
+    monkeypatch.setattr(Refits, "best", lambda _, fits: fits[0])
+    with Campaign(tmp_path / "steps", {}) as campaign:
+        fits = Fits(Refits(found.recordings, jaxid.OEM()), campaign)
+        for factor in (1.0, 1.0, 1.1):
+            loop = found.loop.with_theta(factor * found.loop.theta)
+            fits.exchanged(loop, loop.effects[-1:], loop.effects[-1:], ())
+    assert len(asked) == 2

@@ -62,6 +62,37 @@ def test_levels_are_those_of_the_noise():
     assert np.isclose(found.noise[0].variance, 7.0, rtol=0.1)
 
 
+def at_rest(data: Data, share: float) -> Data:
+    """The same data with that share of the rows not compared, in the middle of each recording."""
+    rows = np.abs(TIME - 0.5) < share / 2
+    cut = {n: np.where(rows[:, None, None], 0.0, getattr(data, n)) for n in ("base", "table")}
+    cut["table"] = cut["table"].astype(np.float32)
+    return dataclasses.replace(data, residual=np.where(rows[:, None], 0.0, data.residual), **cut)
+
+
+def test_rows_at_rest_do_not_make_the_noise_weaker():
+    rng = np.random.default_rng(15)
+    blocks, values, variances = [(0,), (1,), (2,), (3,)], [], []
+    for _ in range(DRAWS):
+        found = estimate_noise(at_rest(drawn(rng, (1.0, 1.0)), 0.5), blocks)
+        values.append(p_value(found.data, found.noise))
+        variances.append(found.noise[0].variance)
+    assert np.mean(variances) == pytest.approx(1.0, rel=0.03)
+    low, high = binom.interval(0.999, DRAWS, 0.05)
+    assert low <= np.sum(np.array(values) < 0.05) <= high
+
+
+def test_recordings_of_equal_noise_have_one_level_however_long_they_rest():
+    rng, apart = np.random.default_rng(16), 0
+    for _ in range(20):
+        whole, resting = (drawn(rng, (1.0,)) for _ in range(2))
+        resting = at_rest(resting, 0.6)
+        names = "residual", "base", "table", "mask"
+        both = {n: np.concatenate([getattr(x, n) for x in (whole, resting)]) for n in names}
+        apart += estimate_noise(Data(**both), [(0,), (1,)]).data.level is not None
+    assert apart <= 2
+
+
 def test_a_recording_without_noise_is_no_division_by_zero():
     data = drawn(np.random.default_rng(13), (0.0, 1.0))
     found = estimate_noise(data, [(0,), (1,)])

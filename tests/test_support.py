@@ -10,8 +10,10 @@ from test_release import axis as drive
 
 import jaxid
 from jaxid.control import Tracking
-from jaxid.discovery.support import _errors
+from jaxid.discovery.data import Data
+from jaxid.discovery.support import _errors, _stretches
 from jaxid.effects import EndStop, Spring, ThermalDrift
+from jaxid.estimate.minimise import Prior
 
 STRETCH = np.repeat(np.arange(6), 200)
 
@@ -29,6 +31,31 @@ def test_a_stretch_that_is_left_out_is_predicted_from_the_others(everywhere):
     gain = (apart_without - apart) / (without - fitted)
     # An amplitude that 1000 rows tell is predicted as well as it is fitted.
     assert gain == pytest.approx(1.0, abs=0.02) if everywhere else abs(gain) < 0.05
+
+
+def test_each_recording_is_cut_by_its_own_length():
+    """A short recording is padded, and an effect may act in it alone."""
+    mask = np.arange(600) < np.array([600, 90])[:, None]
+    shape = (2, 600, 2)
+    known = Prior(np.eye(1, 3), np.zeros(3))
+    data = Data(np.ones(shape), np.ones((*shape, 3)), np.ones((*shape, 0)), mask, known=known)
+    *rows, last = _stretches(data)
+    assert last == -1
+    number = np.reshape(rows, shape)[..., 0]
+    sizes = [
+        np.unique(n[m], return_counts=True)[1].tolist() for n, m in zip(number, mask, strict=True)
+    ]
+    assert sizes == [[200] * 3, [30] * 3]
+    assert not set(number[0][mask[0]]) & set(number[1][mask[1]])
+
+
+def test_a_prior_belongs_to_every_estimate():
+    """Without rows that are left out, knowledge of a value changes what is fitted and predicted."""
+    rng = np.random.default_rng(4)
+    column, noise = rng.standard_normal((2, 1200))
+    target, columns = np.append(column + noise, 0.0), np.append(column, 1e9)[:, None]
+    fitted, apart = _errors(target, columns, np.append(STRETCH, -1))
+    assert [fitted, apart] == pytest.approx([np.sum((column + noise) ** 2)] * 2, rel=1e-3)
 
 
 def warming(there: np.ndarray | float = 1.0) -> jaxid.Recording:

@@ -11,9 +11,10 @@ from ..display.progress import live_figure, working
 from ..effects import AbstractEffect
 from ..effects import catalogue as known
 from ..errors import FitError
-from ..estimate import OEM, Status
+from ..estimate import OEM, Fit, Status
 from ..estimate.standstill import slow_note, worst_at_standstill
 from ..recording import Recording, Recordings
+from ..simulation.batch import prepare
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..simulation.sharing import with_one_blas_thread
@@ -21,7 +22,7 @@ from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
 from .alongside import along_recorded, in_the_loop
 from .asked import Asked, check_apart
-from .comparison import compare
+from .comparison import Comparison, compare
 from .diagnosis import over_recordings
 from .hypotheses import effect_on
 from .landscape import form
@@ -108,6 +109,9 @@ def discover(
     held_out = None if validate is None else Recordings.of(validate)
     Recordings.of([*recordings, *(held_out or ())]).common_period()
     check_apart(recordings, held_out or ())
+    if held_out is not None:
+        # A held-out recording that cannot be used is refused before the search.
+        prepare(loop, held_out)
     asked = Asked(
         recordings, held_out, method or OEM(), tuple(catalogue), significance, worth, most
     )
@@ -165,11 +169,11 @@ def _searched(search: Search, loop: ClosedLoop, started: float) -> Discovery:
     """The result of a search; if it is interrupted, that of the best fitted model."""
     try:
         verdict, unfinished = search.run(loop)
+        return _told(search, verdict, unfinished, started)
     except KeyboardInterrupt:
         if not search.stopped():
             raise
         return _told(search, "undetermined", False, started, interrupted=True)
-    return _told(search, verdict, unfinished, started)
 
 
 def _told(
@@ -180,10 +184,12 @@ def _told(
     steps = _tested(search, _steps(search, models))
     models = _held_out(search, models, steps)
     short = _stopped_short(search.asked.most)
-    reason = _STOPPED if interrupted else _raised(search, steps)
+    reason = _STOPPED if interrupted else _diverges(search, steps[-1]) or _raised(search, steps)
     if not reason:
         reason = _doubt(search, verdict, steps)
         if unfinished and steps[-1].fit.status is Status.converged:
+            if reason:
+                search.note(f"the model also fails a test: {reason}")
             reason = short
     reason = reason or search.refuted
     if (reason and not interrupted) or verdict == "outside_catalogue":
@@ -197,6 +203,7 @@ def _told(
         steps = _final(search, steps)
         models = tuple(_as_shown(m, steps[-1]) if m.fit is search.at.fit else m for m in models)
     notes = (*remarks(steps, search.given, search.offsets), *search.failures)
+    notes = (*_without_recordings(search.asked.recordings, steps[0].fit), *notes)
     if unfinished and reason != short:
         notes = (short, *notes)
     return Discovery(
@@ -219,7 +226,7 @@ def _final(search: Search, steps: Sequence[Step]) -> list[Step]:
     can be uncertain although the effect is not.
     """
     search.watched.begin("fit", "fits with the shapes of added effects free")
-    last, held_out = steps[-1], search.asked.held_out
+    last = steps[-1]
     try:
         needed = without_parts(search.fits, search.at)
         if needed is not search.at.fit:
@@ -229,8 +236,7 @@ def _final(search: Search, steps: Sequence[Step]) -> list[Step]:
         search.note("held shapes of the added effects were not estimated: interrupted")
         return list(steps)
     if fit is not last.fit:
-        held = None if held_out is None else compare(fit, held_out)
-        last = dataclasses.replace(last, fit=fit, held_out=held)
+        last = dataclasses.replace(last, fit=fit, held_out=_on_held_out(search, fit))
     return [*steps[:-1], last]
 
 
@@ -294,16 +300,48 @@ def _raised(search: Search, steps: Sequence[Step]) -> str:
     return reason + said * some
 
 
+def _without_recordings(asked: Recordings, first: Fit) -> list[str]:
+    """A note on recordings that the search left out, because the first fit diverged there."""
+    kept = {r.name for r in first.recordings}
+    gone = [r.name for r in asked if r.name not in kept]
+    if not gone:
+        return []
+    return [
+        f"{joined(gone)} was left out of all fits, because the simulation of the starting model "
+        "along it diverges: start from other values, or check this recording"
+    ]
+
+
+def _on_held_out(search: Search, fit: Fit) -> Comparison | None:
+    """A fit on the held-out recordings; None if there are none, or if it diverges along them."""
+    if search.asked.held_out is None:
+        return None
+    try:
+        return compare(fit, search.asked.held_out)
+    except FitError as error:
+        search.note(str(error))
+        return None
+
+
+def _diverges(search: Search, last: Step) -> str:
+    """The reason if the final model cannot be simulated along the held-out recordings."""
+    if search.asked.held_out is None or last.held_out is not None:
+        return ""
+    return (
+        "the model diverges when it is simulated along a held-out recording, which a note names: "
+        "check that recording, or fit recordings with motions like it as well"
+    )
+
+
 def _held_out(search: Search, models: Sequence[Model], steps: Sequence[Step]) -> tuple[Model, ...]:
     """Models with their error on held-out recordings, computed if their weight is large enough."""
     known = {id(s.fit): s.held_out for s in steps}
-    held_out = search.asked.held_out
     found = []
     for m in models:
         if m.fit is not None and id(m.fit) in known:
             m = dataclasses.replace(m, held_out=known[id(m.fit)])
-        elif m.fit is not None and held_out is not None and m.weight > _SHOWN:
-            m = dataclasses.replace(m, held_out=compare(m.fit, held_out))
+        elif m.fit is not None and m.weight > _SHOWN:
+            m = dataclasses.replace(m, held_out=_on_held_out(search, m.fit))
         found.append(m)
     return tuple(found)
 
@@ -321,12 +359,10 @@ def _steps(search: Search, weighed: Sequence[Model]) -> list[Step]:
     steps = []
     for k, model in enumerate(models):
         assert model.fit is not None
-        held_out = search.asked.held_out
-        held = None if held_out is None else compare(model.fit, held_out)
         step = Step(
             label="start",
             fit=model.fit,
-            held_out=held,
+            held_out=_on_held_out(search, model.fit),
             diagnosis=search.diagnoses.get(model.key),
         )
         if k:

@@ -132,7 +132,7 @@ def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, .
     predictor = Predictor.of(screened.system, diagnosis.noise, data.level)
     drives = [TimeDelay(joint=j + 1, delay=jnp.asarray(period / 2)) for j in range(loop.joints)]
     nothing, late = predictor.predict(()), predictor.predict(drives)
-    rows = int(data.mask.sum()) * data.residual.shape[2]
+    rows = int(data.compared.sum())
     gain = rows * np.log(nothing.loss / late.loss) - len(drives) * np.log(rows)
     if not late.possible or gain < DECISIVE:
         return ()

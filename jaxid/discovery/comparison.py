@@ -223,15 +223,15 @@ def compare(
     """
     loop = model.loop if isinstance(model, Fit) else model
     recordings = Recordings.of(recordings)
-    if window is None and isinstance(model, Fit):
-        window = getattr(model.method, "window", None)
-    runs = _simulate_in_windows(oem_of(model), loop, recordings, window)
+    method = oem_of(model)
+    window = method.window if window is None else window
+    runs = _simulate_in_windows(method, loop, recordings, window)
     for run, recording in zip(runs, recordings, strict=True):
         if not np.isfinite(run.tau).all() or not np.isfinite(run.q).all():
             raise FitError(
                 f"the loop {loop.name} diverges when it is simulated along {recording.name} "
-                f"({reason(run.result)}): fit it first, start from other values, or use smaller "
-                "steps (jaxid.Stepping(substeps=...))"
+                f"({reason(run.result)}): check this recording, fit the loop first or from other "
+                "values, or use smaller steps (jaxid.Stepping(substeps=...))"
             )
     return Comparison(
         loop=loop, recordings=recordings, runs=runs, errors=_errors(loop, recordings, runs)

@@ -47,6 +47,11 @@ class Data(eqx.Module):
     kept: tuple[int, ...] | None = eqx.field(static=True, default=None)
     known: Prior | None = None
 
+    @property
+    def compared(self) -> Int[np.ndarray, "recordings outputs"]:
+        """Number of compared rows; rows at which a joint is at rest are zero and do not count."""
+        return np.count_nonzero(self.residual, axis=1)
+
     def columns(
         self, numbers: Sequence[int]
     ) -> Float[np.ndarray, "recordings samples outputs columns"]:

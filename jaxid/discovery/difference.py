@@ -278,7 +278,11 @@ def changes(
     # Rows at which a joint is at rest are zero and must remain zero.
     there = [(a != 0) | (b != 0) for a, b in zip(*rows, strict=True)]
     noise = noise_filters(near)
-    strengths = levels([innovations(r, noise) for r in near])
+    # The noise of the other rows is stronger than the mean over all of them.
+    strengths = [
+        level * np.sqrt(len(t) / np.maximum(t.sum(axis=0), 1))
+        for level, t in zip(levels([innovations(r, noise) for r in near]), there, strict=True)
+    ]
     rng = np.random.default_rng(seed)
     made = drawn_noise(noise, [len(r) for r in near], draws, rng, strengths)
     found = []

@@ -1,7 +1,10 @@
 """The full fits of a search, saved under names that identify their models."""
 
 import dataclasses
+import hashlib
 from collections.abc import Callable, Sequence
+
+import numpy as np
 
 from ..effects import AbstractEffect
 from ..estimate import Fit
@@ -156,7 +159,10 @@ class Fits:
             plain = [refits.unfiltered(start, noise).loop] if new else []
             return refits.best([refits.filtered(x, noise) for x in (start, *plain)])
 
-        name = f"{piece_name(effects)}, {'instead' if new else 'alone'}"
+        # The same effects may be fitted again, from the values of another model.
+        values = np.array2string(np.asarray(start.theta), precision=6)
+        mark = hashlib.sha256(values.encode()).hexdigest()[:12]
+        name = f"{piece_name(effects)}, {'instead' if new else 'alone'}, from {mark}"
         return self._saved(name, loop, better)
 
     def _saved(self, name: str, loop: ClosedLoop, work: Callable[[], Fit]) -> Fit:

@@ -79,16 +79,16 @@ def noise_filters(
 
 def _scored(series: Sequence[Sequence[np.ndarray]], freedom: int, paid: float) -> Score:
     # Rows at which a joint is at rest are zero, and are not counted.
-    total = sum(np.count_nonzero(s) for rows in series for s in rows)
+    total = max(sum(np.count_nonzero(s) for rows in series for s in rows), 1)
     value, noise = 0.0, []
     for rows in series:
         # The mean is not subtracted: the model must explain it.
         found = filter_of(rows, _HIGHEST)
-        size = np.array([max(np.count_nonzero(s), 1) for s in rows])
+        size = np.array([np.count_nonzero(s) for s in rows])
         # Each recording has its own noise level if that lowers the score.
         power = np.array([np.sum(found.whiten(s)[found.order :] ** 2) for s in rows])
         power = np.maximum(power / np.maximum(size - found.order, 1), 1e-300)
-        mean = float(size @ power / size.sum())
+        mean = max(float(size @ power) / max(size.sum(), 1), 1e-300)
         apart = float(size @ np.log(power)) + (len(rows) - 1) * math.log(total)
         value += min(size.sum() * math.log(mean), apart)
         freedom += found.order

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..compiling import compiled
 from ..effects import AbstractTransmission, Motion
@@ -258,6 +258,14 @@ def at_samples(
         batch.band, batch.moving, batch.mask, table.reshape(*table.shape[:3], -1)
     )
     return found.reshape(*found.shape[:3], *columns)
+
+
+def row_period(
+    time: Float[np.ndarray, "recordings rows"], mask: Bool[np.ndarray, "recordings rows"]
+) -> float:
+    """Time between compared rows, s. Padding of recordings that are shorter repeats their end."""
+    longest = int(mask.sum(axis=1).argmax())
+    return float(np.median(np.diff(time[longest, mask[longest]])))
 
 
 def at_rows(batch: Batch, tree: Any) -> Any:

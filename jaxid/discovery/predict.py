@@ -115,7 +115,7 @@ class Predictor(eqx.Module):
             return self._reached(_with_values(effects, fill.emptied(y)[0]))
 
         y = fill.unknowns((first, np.zeros((0, 0))))
-        rows = int(self.data.mask.sum()) * self.data.residual.shape[2]
+        rows = int(self.data.compared.sum())
         limits = bounds.lower, bounds.upper
         settings = Stopping(tolerance=0.05, max_steps=steps)
         found, _, _ = descend(at, at(y), y, limits, fill, rows, settings)

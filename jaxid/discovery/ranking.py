@@ -173,8 +173,7 @@ def _floor(
 
     Estimated parameters absorb a part of the noise. The result is corrected for this part.
     """
-    outputs = data.residual.shape[2]
-    freedom = 1 - (data.base.shape[-1] + lost) / (data.mask.sum() * outputs)
+    freedom = 1 - (data.base.shape[-1] + lost) / data.compared.sum()
     # The rich model has the smaller whitened residual. Its residual itself may be the larger one.
     share = np.minimum(share_left(fit, data, rest), 1) / np.sqrt(max(freedom, 0.1))
     return fit.error_percent.to_numpy() * share

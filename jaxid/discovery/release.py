@@ -197,7 +197,7 @@ def _finer(loop: ClosedLoop, before: ClosedLoop) -> ClosedLoop:
 def _fall(predictor: Predictor, gain: float) -> float:
     """Decrease of the score if that much of the squared error is explained."""
     left = float(np.sum(_white(predictor, predictor.data.residual) ** 2))
-    rows = int(predictor.data.mask.sum()) * predictor.data.residual.shape[2]
+    rows = int(predictor.data.compared.sum())
     return rows * float(np.log(left / max(left - gain, 1e-9 * left)))
 
 

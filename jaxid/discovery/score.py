@@ -72,7 +72,7 @@ class Whitened(eqx.Module):
         for part in parts:
             part.values[...] /= size[part.columns].astype(part.values.dtype)
         unknown = len(data.mask) * sum(f.order for f in noise)
-        rows = data.mask.sum() * data.residual.shape[2] + len(data.known_left())
+        rows = data.compared.sum() + len(data.known_left())
         count = rows - unknown - basis.shape[1]
         across = _products(parts, basis.astype(data.table.dtype), len(size))
         return cls(r, parts, basis, across, size, float(count))

@@ -21,7 +21,7 @@ from .comparison import Comparison
 from .data import Data
 from .diagnosis import Diagnosis
 from .hypotheses import Hypothesis, candidates, curves, survey
-from .linear import at_rows
+from .linear import at_rows, row_period
 from .ranking import Screened, judge
 from .signatures import signatures
 from .system import System
@@ -132,7 +132,7 @@ def offered(
     """
     loop, motion = system.loop, system.linear.motion
     time = np.asarray(at_rows(system.batch, motion.t))
-    tones, trials = _tones(system.residual, system.mask, float(np.median(np.diff(time[0]))))
+    tones, trials = _tones(system.residual, system.mask, row_period(time, system.mask))
     scene = survey(loop, recordings, motion, tones)
     parted = {e.joint for e in loop.effects if isinstance(e, AbstractTransmission)}
     proposed = [

@@ -142,7 +142,7 @@ class Search(Started):
         - `predictor`: the linear system of the model. `noise`: the filters of the fit.
         - `effect`: decrease of the score by the best single effect.
         """
-        value = np.log(predictor.data.mask.sum() * predictor.system.loop.joints)
+        value = np.log(predictor.data.compared.sum())
         release = released(predictor, value + DECISIVE)
         if release is None or release.gain < effect:
             return None
@@ -329,8 +329,10 @@ class Search(Started):
         sets = [c for c in plain if not any(x <= Counter(c.key) for x in loose)]
         if curved and curved[0].score <= min(c.score for c in sets):
             return "outside_catalogue", False
-        left = [c for c in plain if c.effects and c.score < nothing]
-        return ("explained" if self.at.effects else "adequate"), unfinished and bool(left)
+        # A further effect counts if it would be added: by odds of 20 to 1, and with support.
+        better = [c for c in sets if c.effects and c.score < nothing - LIKELY]
+        unfinished = unfinished and any(map(self._supported, better[:_EXAMINED]))
+        return ("explained" if self.at.effects else "adequate"), unfinished
 
 
 def _lost(model: Model, at: Model) -> bool:

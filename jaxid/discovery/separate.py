@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..noise import ARFilter, fit_ar
+from ..noise import ARFilter, centred, fit_ar
 from .data import Data, Rows
 from .score import Blocks, Whitened, by_width, explained_by, strong_directions
 
@@ -38,8 +38,8 @@ def estimate_noise(data: Data, blocks: Blocks, alike: bool = False) -> Separated
     - `alike`: whether all data have one noise level, because they are windows of recordings.
     """
     flat = tuple(
-        ARFilter(np.zeros(0), float(np.mean(np.concatenate(data.series(data.residual, j)) ** 2)))
-        for j in range(data.residual.shape[2])
+        ARFilter(np.zeros(0), sum(float(x @ x) for x in data.series(data.residual, j)) / rows)
+        for j, rows in enumerate(np.maximum(data.compared.sum(axis=0), 1))
     )
     plain = leftover(data, flat, ())
     white = noise_of(data, plain, data.base.shape[-1], highest=0)
@@ -63,14 +63,13 @@ def _settle(data: Data, noise: tuple[ARFilter, ...], blocks: Blocks, alike: bool
         data, noise = levelled(data, rest, data.base.shape[-1] + len(columns), alike)
         if chosen == before:
             break
-    size = data.mask.sum(axis=1)
-    spread = sum(size.sum() * np.log(f.variance) for f in noise)
+    size = data.compared
+    spread = float(size.sum(axis=0) @ np.log([f.variance for f in noise]))
     free = len(columns) + sum(f.order for f in noise)
     if data.level is not None:
-        spread += 2 * float(size @ np.log(data.level).sum(axis=1))
+        spread += 2 * float(np.sum(size * np.log(data.level)))
         free += (len(size) - 1) * np.sum(np.any(data.level != 1, axis=0))
-    bic = float(spread + free * np.log(size.sum() * len(noise)))
-    return Separated(data, noise, chosen, bic)
+    return Separated(data, noise, chosen, float(spread + free * np.log(size.sum())))
 
 
 def columns_of(blocks: Blocks, chosen: Sequence[int]) -> list[int]:
@@ -87,14 +86,14 @@ def noise_of(data: Data, rows: Rows, lost: float, highest: int = 30) -> tuple[AR
     - `lost`: number of parameters of that model.
     - `highest`: largest order.
     """
-    outputs = rows.shape[2]
-    total = float(data.mask.sum())
-    share = 1 / (1 - min(lost / outputs / total, 0.5))
+    outputs, counted = rows.shape[2], data.compared.sum(axis=0)
     filters = []
     for j in range(outputs):
-        series = [s - s.mean() for s in data.series(rows, j)]
+        series = [centred(s) for s in data.series(rows, j)]
         found = filter_of(series, highest)
-        filters.append(ARFilter(found.coefficients, max(found.variance * share, 1e-300)))
+        free = max(counted[j] - lost / outputs, counted[j] / 2, 1)
+        variance = found.variance * data.mask.sum() / free
+        filters.append(ARFilter(found.coefficients, max(variance, 1e-300)))
     return tuple(filters)
 
 
@@ -130,12 +129,12 @@ def levelled(
     if alike:
         return data, noise
     white = data.white(rows, noise)
-    count = data.mask.sum(axis=1)[:, None] - np.array([f.order for f in noise])
-    power = np.sum(white**2, axis=1) / count
-    mean = np.sum(count * power, axis=0) / count.sum(axis=0)
+    count = np.maximum(data.compared - np.array([f.order for f in noise]), 0)
+    power = np.sum(white**2, axis=1) / np.maximum(count, 1)
+    mean = np.sum(count * power, axis=0) / np.maximum(count.sum(axis=0), 1)
     ratio = np.maximum(power / np.where(mean > 0, mean, 1.0), 1e-4)
     gain = -np.sum(count * np.log(ratio), axis=0)
-    differ = (mean > 0) & (gain > (len(ratio) - 1) * np.log(count.sum(axis=0)))
+    differ = (mean > 0) & (gain > (len(ratio) - 1) * np.log(np.maximum(count.sum(axis=0), 1)))
     if not differ.any():
         return data, noise
     data = dataclasses.replace(data, level=np.sqrt(np.where(differ, ratio, 1.0)))

@@ -59,13 +59,13 @@ class Discovery(AbstractShown):
       the tests), `"explained"` (effects were added, no further candidate improves the score, and
       the model passes the tests), `"outside_catalogue"` (a curve of one coordinate describes the
       residual better than effects of the catalogue do) or `"undetermined"` (the model fails a test,
-      the recordings do not decide, or the search was interrupted).
+      the recordings do not decide, or the search stopped at `most` or was interrupted).
     - `steps`: the first is the starting model.
     - `reason`: why it is undetermined, and what to do; empty for the other verdicts.
     - `considered`: the examined models, best first.
     - `removed`: effects that were added, and removed later because they were not needed.
     - `unfinished`: whether the limit `most` stopped the search although another effect would
-      improve the score. The verdict may still be `"explained"`.
+      improve the score. The verdict is then `"undetermined"`.
     - `interrupted`: whether the search was interrupted; the last step is the best model until then.
     """
 
@@ -330,7 +330,7 @@ class Discovery(AbstractShown):
                     "joint": getattr(step.added, "joint", None),
                     "recordings": list(getattr(step.added, "recordings", ())),
                     "parameters": found_parameters(self.steps, k),
-                    "probability": step.probability,
+                    "probability": None if step.unseen == "raises" else step.probability,
                     "held_out": step.unseen,
                     "indistinguishable": [{"effect": n, "joint": j} for n, j in step.alike],
                 }

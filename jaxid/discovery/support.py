@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..effects import AbstractEffect
+from .data import Data
 from .explore import Candidate
 from .hypotheses import free_of
 from .predict import Predictor
@@ -19,6 +20,8 @@ _STRETCHES, _LEAST = 6, 2
 _SUPPORTED = 0.3
 # Share of a column's power that the other stretches must contain to determine its value.
 _WEAK = 1e-4
+# Number of the rows of a prior, which belong to every estimate.
+_ALWAYS = -1
 
 
 def unsupported(predictor: Predictor, c: Candidate) -> tuple[AbstractEffect, ...]:
@@ -35,7 +38,7 @@ def unsupported(predictor: Predictor, c: Candidate) -> tuple[AbstractEffect, ...
     - `predictor`: the linear system of the fitted model.
     - `c`: a set of additional effects with values estimated in that system.
     """
-    stretch = _stretches(predictor)
+    stretch = _stretches(predictor.data)
     return tuple(
         effect
         for k, effect in enumerate(c.effects)
@@ -51,13 +54,13 @@ def _share(
     shown = predictor.shown(c.effects[which])[..., 0]
     # The target is the residual without the effect. An amplitude that the other stretches do not
     # determine is then estimated as zero, not as its value in the fit.
-    parts = (c.rest + shown)[..., None], data.base, c.prediction.moved
-    rows = data.white(np.concatenate(parts, axis=-1), c.noise)
-    target, columns = np.split(rows.reshape(-1, rows.shape[-1]), [1], axis=1)
+    target = data.white_residual(c.rest + shown, c.noise, c.taken)
+    parts = data.base, c.prediction.moved
+    columns = data.white_columns(np.concatenate(parts, axis=-1), c.noise, slice(None))
     own = data.base.shape[-1] + _values_of(c.effects, which)
     others = np.setdiff1d(np.arange(columns.shape[1]), own)
-    less = _errors(target[:, 0], columns[:, others], stretch)
-    more = _errors(target[:, 0], columns, stretch)
+    less = _errors(target, columns[:, others], stretch)
+    more = _errors(target, columns, stretch)
     return float((less[1] - more[1]) / max(less[0] - more[0], 1e-300))
 
 
@@ -67,13 +70,15 @@ def _values_of(effects: Sequence[AbstractEffect], which: int) -> Int[np.ndarray,
     return sum(counts[:which]) + np.arange(counts[which])
 
 
-def _stretches(predictor: Predictor) -> Int[np.ndarray, " rows"]:
-    """The number of the stretch of each whitened row."""
-    recordings, samples, outputs = predictor.data.residual.shape
-    each = max(_LEAST, -(-_STRETCHES // recordings))
-    number = np.arange(samples) * each // samples
-    both = number[None, :] + each * np.arange(recordings)[:, None]
-    return np.repeat(both.reshape(-1), outputs)
+def _stretches(data: Data) -> Int[np.ndarray, " rows"]:
+    """The number of the stretch of each whitened row, the rows of a prior last."""
+    each = max(_LEAST, -(-_STRETCHES // len(data.mask)))
+    # Each recording is cut by its own compared rows, since short ones are padded.
+    passed = np.cumsum(data.mask, axis=1) - data.mask
+    number = passed * each // np.maximum(data.mask.sum(axis=1, keepdims=True), 1)
+    both = np.minimum(number, each - 1) + each * np.arange(len(data.mask))[:, None]
+    rows = np.repeat(both.reshape(-1), data.residual.shape[2])
+    return np.append(rows, np.full(len(data.known_left()), _ALWAYS))
 
 
 def _errors(
@@ -87,9 +92,10 @@ def _errors(
     gram, along = columns.T @ columns, columns.T @ target
     weak = _WEAK * np.eye(len(gram))
     fitted = target - columns @ np.linalg.solve(gram + weak, along)
+    measured = stretch != _ALWAYS
     apart = 0.0
-    for k in np.unique(stretch):
+    for k in np.unique(stretch[measured]):
         rows, y = columns[stretch == k], target[stretch == k]
         values = np.linalg.solve(gram - rows.T @ rows + weak, along - rows.T @ y)
         apart += float(np.sum((y - rows @ values) ** 2))
-    return float(fitted @ fitted), apart
+    return float(fitted[measured] @ fitted[measured]), apart

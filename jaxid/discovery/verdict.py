@@ -15,6 +15,7 @@ from .diagnosis import Diagnosis, over_recordings
 from .episodes import in_episodes
 from .explore import DECISIVE
 from .floor import SPOKEN, Floor, floor_of
+from .linear import row_period
 from .loose import undetermined
 from .models import listed
 from .relevance import REFUTED, allowed
@@ -39,14 +40,13 @@ def misfit_of(fit: Fit) -> str:
 
 def _to_check(fit: Fit) -> str:
     """The mistake in the data that explains a misfit, or what to check."""
-    return (
-        fit.mistake
-        or at_limit(fit.recordings)
-        or (
-            "check the units of each joint, signs, the order of the joints, time stamps and the "
-            "control law"
-        )
+    check = (
+        "check the units of each joint, signs, the order of the joints, time stamps and the "
+        "control law"
     )
+    if limited := at_limit(fit.recordings):
+        check = f"{limited}; cut out these stretches, or record a slower motion; otherwise {check}"
+    return fit.mistake or check
 
 
 def indefinite(chosen: Fit, added: int) -> str:
@@ -138,7 +138,7 @@ def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
     torque, time = np.asarray(motion.tau), np.asarray(motion.t)
     if torque.shape != data.residual.shape or data.residual.shape[1] < 3:
         return ""
-    step = float(np.median(np.diff(time[0])))
+    step = row_period(time, data.mask)
     # Without the noise filters, which may have modelled the shift as noise.
     basis = spanned(data.base.reshape(-1, data.base.shape[-1]))
     left = data.residual.reshape(-1)

@@ -16,7 +16,7 @@ from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from .diagnosis import over_recordings
 from .hypotheses import free_of
-from .likelihood import noise_filters, score_of
+from .likelihood import noise_filters, price_of_value, score_of
 from .signs import from_usual_signs, has_one_sign, of_one_sign, reshaped
 
 # Factor on the gap at the start of another refit. In a wide gap the link moves freely for longer,
@@ -275,7 +275,7 @@ def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
         return False
     # The increase of the squared error without the effect, and the decrease of the price.
     lost = wald(fit, own)
-    saved = len(places) * np.log(sum(r.size for r in fit.residuals)) + price
+    saved = len(places) * price_of_value(fit) + price
     return bool(lost > (_RESHAPED if reshaped(fit.loop, effect) else _CERTAIN) * saved)
 
 

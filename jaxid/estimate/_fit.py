@@ -73,7 +73,7 @@ def fit(
         found = again
     found = _followed(_doubted(_examined(_without_nan(found), loop)))
     notes = (*found.notes, *_matter(found), *drawing_notes(found), *_band(loop, recordings))
-    notes = (*notes, *slow_note(given, found.loop), *_gaps(recordings))
+    notes = (*notes, *slow_note(given, found.loop), *_uncompared(found), *_gaps(recordings))
     notes = (*notes, *_begun(loop, recordings))
     return dataclasses.replace(found, notes=notes)
 
@@ -151,6 +151,16 @@ def _begun(loop: ClosedLoop, recordings: Recordings) -> list[str]:
             "where it has been at rest"
         )
     return notes
+
+
+def _uncompared(found: Fit) -> list[str]:
+    """Notes on joints that have no compared sample in a recording."""
+    return [
+        f"joint {j + 1} rests in almost all of {r.name}, so its torque is not compared there"
+        for r, rows in zip(found.recordings, found.residuals, strict=False)
+        for j in np.flatnonzero(~rows.any(axis=0))
+        if found.loop.controller.imposes
+    ]
 
 
 def _gaps(recordings: Recordings) -> list[str]:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..compiling import compiled
 from ..errors import FitError
-from ..noise import Noise, fit_ar, innovations
+from ..noise import Noise, centred, fit_ar, innovations
 from ..parameters import Bounds
 from .minimise import Problem, Sensitivity, absorb_start, linearise, unfiltered
 from .result import Fit, determined_covariance
@@ -184,8 +184,10 @@ def score_covariance(
     units = np.outer(length, length)
     meat, inverse = np.zeros((p, p)), np.linalg.pinv(information / units, hermitian=True) / units
     for o in range(outputs):
-        series = [r[:, o] - r[:, o].mean() for r in residuals]
-        strengths = [float(np.std(x)) or 1.0 for x in series]
+        series = [centred(r[:, o]) for r in residuals]
+        strengths = [float(np.sqrt(np.mean(x**2))) or 1.0 for x in series]
+        # Rows at which a joint is at rest are zero, so the noise of the others is stronger.
+        shares = [max(np.count_nonzero(x), 1) / len(x) for x in series]
         # Low-passed residuals have almost no power above the cutoff, which makes a fitted filter
         # ill-conditioned: a white floor at -100 dB keeps it stable.
         floor = np.random.default_rng(0)
@@ -195,12 +197,12 @@ def score_covariance(
                 for x, strength in zip(series, strengths, strict=True)
             ]
         )
-        for j, strength in zip(jacobians, strengths, strict=True):
+        for j, strength, share in zip(jacobians, strengths, shares, strict=True):
             size = 1 << int(np.ceil(np.log2(2 * j.shape[0])))
             wave = np.fft.fft(j[:, o], size, axis=0)
             leverage = np.real(np.einsum("fp,pq,fq->f", wave.conj(), inverse, wave)) / j.shape[0]
             kept = np.maximum(1 - leverage, _KEPT)
-            power = (strength**2 * noise.spectrum(size) / kept)[:, None]
+            power = (strength**2 / share * noise.spectrum(size) / kept)[:, None]
             meat += np.real(wave.conj().T @ (power * wave)) / size
     return meat
 

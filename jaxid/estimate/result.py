@@ -261,14 +261,18 @@ def relative_errors(
     measured: Sequence[Float[np.ndarray, "_samples joints"]],
     residuals: Sequence[Float[np.ndarray, "_samples joints"]],
 ) -> "pd.DataFrame":
-    """100 · ‖residual‖ / ‖measured‖ by recording and joint (Table 3 of Brunot et al. 2016)."""
+    """100 · ‖residual‖ / ‖measured‖ by recording and joint (Table 3 of Brunot et al. 2016).
+
+    It is zero for a joint without compared samples in a recording: both norms are zero there.
+    """
     import pandas as pd
 
     # The error of a diverging loop is infinite; no warning is needed.
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", divide="ignore"):
         rows = [
-            100 * np.linalg.norm(e, axis=0) / np.linalg.norm(m, axis=0)
+            100 * np.linalg.norm(e, axis=0) / np.where(m.any(axis=0) | e.any(axis=0), size, 1.0)
             for m, e in zip(measured, residuals, strict=True)
+            for size in [np.linalg.norm(m, axis=0)]
         ]
     names = pd.Index([r.name for r in recordings], name="recording")
     return pd.DataFrame(rows, index=names, columns=joint_columns(measured[0].shape[1]))

@@ -14,5 +14,6 @@ from .vector import fit_var as fit_var
 from .vector import innovations as innovations
 from .whiteness import LjungBox as LjungBox
 from .whiteness import autocorrelation as autocorrelation
+from .whiteness import centred as centred
 from .whiteness import levels as levels
 from .whiteness import ljung_box as ljung_box

@@ -25,6 +25,12 @@ def autocovariance(
     return total / sum(len(x) for x in series)
 
 
+def centred(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+    """A residual without its mean. Samples that are not compared are zero, and stay zero."""
+    there = x != 0
+    return np.where(there, x - x.sum() / max(np.count_nonzero(there), 1), 0.0)
+
+
 def levelled(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]:
     """Several series scaled to a common noise level.
 

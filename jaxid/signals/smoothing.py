@@ -107,7 +107,7 @@ def signal_cutoff(*recordings: Recording, highest: float = 1 / 8) -> float:
     last = int(rate / 2 / apart + 1e-9)
     edges = np.unique(np.round(np.geomspace(4, last, 20)).astype(int)) * apart
     centres, levels = zip(*(_acceleration(r, edges) for r in long), strict=True)
-    centre, level = centres[0], np.sum(levels, axis=0)
+    centre, level = np.mean(centres, axis=0), np.sum(levels, axis=0)
     least = 5 * centre[int(np.argmax(level / centre**2))]
     cutoff = centre[_last_minimum(centre, level, centre >= least)]
     return float(min(max(least, cutoff), rate * highest))
