@@ -9,7 +9,7 @@ REQUIREMENTS := pyproject.toml constraints.txt
 .PHONY: help demo test test-all lint types check docs dist clean
 
 help:
-	@echo "make demo      the story on bundled recordings"
+	@echo "make demo      a discovery on bundled recordings"
 	@echo "make test      the tests, without the slow ones"
 	@echo "make test-all  all tests: also whole searches and notebooks"
 	@echo "make lint      ruff"
@@ -52,7 +52,7 @@ clean:
 	@touch $@
 
 .venv/.installed: .venv/.created $(REQUIREMENTS)
-	@echo "installing jaxid and what it stands on into .venv: a minute or two"
+	@echo "installing jaxid and its dependencies into .venv: a minute or two"
 	$(PIP) --editable .
 	@touch $@
 

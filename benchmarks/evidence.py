@@ -1,10 +1,11 @@
-"""Writes tables from the results of `benchmarks.worlds` and `benchmarks.baselines` into a page.
+"""Writes tables from the results of `benchmarks.worlds` and `benchmarks.baselines` into pages.
 
 Only the text between `<!-- made: NAME -->` and `<!-- end: NAME -->` is replaced, where NAME is
-worlds, calibration, baselines or power. The figure of the power curves (needs the extra `static`)
-is written to `img/power.png` in the folder of the page.
+worlds, by world, calibration, baselines or power; each is in one of the pages. The figure of the
+power curves (needs the extra `static`) is written to `img/power.png` in the folder of the first
+page.
 
-python -m benchmarks.evidence RESULTS... [--page docs/evidence.md] [--no-figure]
+python -m benchmarks.evidence RESULTS... [--pages docs/evidence.md docs/runs.md] [--no-figure]
 """
 
 import argparse
@@ -18,7 +19,8 @@ from ._evidence_power import alone, named, power_figure, power_table
 from ._evidence_tables import WORLDS, Line, by_tool, by_world, calibration
 from ._world_results import read_lines
 
-PAGE = Path(__file__).parents[1] / "docs" / "evidence.md"
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = DOCS / "evidence.md", DOCS / "runs.md"
 PICTURE = Path("img") / "power.png"
 
 
@@ -27,8 +29,10 @@ def sections(lines: Sequence[Line]) -> dict[str, str]:
     ours = [x for x in lines if x["tool"] == "jaxid"]
     found = {}
     if ours:
-        tables = [f"By {world}:\n\n{markdown(by_world(ours, world))}" for world in WORLDS]
-        found["worlds"] = "\n\n".join([origins(ours), markdown(by_tool(ours)), *tables])
+        several = [world for world in WORLDS if len({x[world] for x in ours}) > 1]
+        tables = [f"By {world}:\n\n{markdown(by_world(ours, world))}" for world in several]
+        found["worlds"] = f"{origins(ours)}\n\n{markdown(by_tool(ours))}"
+        found["by world"] = "\n\n".join([origins(ours), *tables])
         found["calibration"] = f"{origins(ours)}\n\n{markdown(calibration(ours), 'probability')}"
     shared = same_cases(lines)
     if any(x["tool"] != "jaxid" for x in shared):
@@ -75,40 +79,44 @@ def markdown(table: pd.DataFrame, corner: str = "") -> str:
     return "\n".join([*head, *rule, *(f"| {' | '.join(row)} |" for row in cells)])
 
 
-def placed(page: str, texts: dict[str, str]) -> str:
-    """The page with new sections between their marks.
+def placed(pages: Sequence[str], texts: dict[str, str]) -> list[str]:
+    """The pages with new sections between their marks.
 
-    **Raises:** `ValueError` if a section has no marks in the page, or several pairs.
+    **Raises:** `ValueError` if a section has no marks in the pages, or several pairs.
     """
+    written = list(pages)
     for name, text in texts.items():
         begin, end = f"<!-- made: {name} -->", f"<!-- end: {name} -->"
         pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.DOTALL)
-        if len(pattern.findall(page)) != 1:
+        if sum(len(pattern.findall(page)) for page in written) != 1:
             raise ValueError(
-                f"the page has no place for {name}, or more than one: "
+                f"the pages have no place for {name}, or more than one: "
                 f"put one pair of lines {begin} and {end} where it is to stand"
             )
-        page = pattern.sub(lambda _, made=f"{begin}\n\n{text}\n\n{end}": made, page)
-    return page
+        made = f"{begin}\n\n{text}\n\n{end}"
+        written = [pattern.sub(lambda _, made=made: made, page) for page in written]
+    return written
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Writes the page; see the module's first lines."""
+    """Writes the pages; see the module's first lines."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("results", type=Path, nargs="+", help="files that --results wrote")
-    parser.add_argument("--page", type=Path, default=PAGE)
+    parser.add_argument("--pages", type=Path, nargs="+", default=PAGES)
     parser.add_argument("--no-figure", action="store_true", help="leave the picture as it is")
     given = parser.parse_args(arguments)
     lines = read_lines(given.results)
     made = sections(lines)
-    page = placed(given.page.read_text(encoding="utf-8"), made)
+    pages = placed([page.read_text(encoding="utf-8") for page in given.pages], made)
     if "power" in made and not given.no_figure:
-        picture = given.page.parent / PICTURE
+        picture = given.pages[0].parent / PICTURE
         picture.parent.mkdir(parents=True, exist_ok=True)
         figure = power_figure(same_cases(lines))
         figure.write_image(picture, width=860, height=380, scale=1.5)
-    given.page.write_text(page, encoding="utf-8")
-    print(f"{len(lines)} lines, sections {', '.join(made) or 'none'}, written to {given.page}")
+    for path, page in zip(given.pages, pages, strict=True):
+        path.write_text(page, encoding="utf-8")
+    where = ", ".join(map(str, given.pages))
+    print(f"{len(lines)} lines, sections {', '.join(made) or 'none'}, written to {where}")
 
 
 if __name__ == "__main__":

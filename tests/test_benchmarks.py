@@ -205,7 +205,7 @@ def _few_results() -> list[dict[str, Any]]:
     alone = {"right": True, "alarm": False, "ratio": 1.0, "sure": True, "verdict": "adequate"}
     lines = [_line("jaxid", 1, **_answer(True, 0.95)), _line("jaxid", 2, **_answer(False, 0.6))]
     lines += [_line("jaxid", 3, "clean", **clean, marks=alone)]
-    lines += [_line("jaxid", 4, error="it broke")]
+    lines += [_line("jaxid", 4, error="it broke", noise="bursts")]
     lines += [
         _line("stepwise", k, visible=[size], **_answer(k == 1)) for k, size in ((1, 5.0), (2, 3.0))
     ]
@@ -238,25 +238,31 @@ def test_evidence_leaves_hand_written_text_and_draws_the_curves(tmp_path):
     from benchmarks import _world_results as results
     from benchmarks import evidence
 
-    page, file = tmp_path / "page.md", tmp_path / "r.jsonl"
+    page, other, file = tmp_path / "page.md", tmp_path / "other.md", tmp_path / "r.jsonl"
     names = ("worlds", "calibration", "baselines", "power")
     marks = [f"<!-- made: {n} -->\nold\n<!-- end: {n} -->\n" for n in names]
     page.write_text("# Title\n" + "by hand\n".join(marks) + "the end\n")
+    other.write_text("<!-- made: by world -->\nold\n<!-- end: by world -->\n")
+    pages = ["--pages", str(page), str(other)]
     with file.open("w") as lines:
         for line in _few_results():
             results.append(lines, line)
-    evidence.main([str(file), "--page", str(page)])
+    evidence.main([str(file), *pages])
     once = page.read_text()
+    assert "By noise" in other.read_text()
+    assert "By law" not in other.read_text()
+    assert "| errors | 0 | 1 |" in other.read_text()
+    assert "old" not in other.read_text()
     assert once.startswith("# Title\n")
     assert once.endswith("the end\n")
     assert once.count("by hand") == 3
     assert "old" not in once
     assert (tmp_path / "img" / "power.png").stat().st_size > 5000
-    evidence.main([str(file), "--page", str(page), "--no-figure"])
+    evidence.main([str(file), *pages, "--no-figure"])
     assert page.read_text() == once
     page.write_text("no marks")
     with pytest.raises(ValueError, match="no place for worlds"):
-        evidence.main([str(file), "--page", str(page)])
+        evidence.main([str(file), *pages])
 
 
 def test_worlds_tell_what_a_logger_aliases():

@@ -134,11 +134,11 @@ def test_pictures_named_in_the_readme_are_there_and_small() -> None:
         assert (ROOT / path).stat().st_size < 400_000
 
 
-def three_joints() -> str:
-    """A URDF of three joints in a row."""
+def in_a_row(*names: str) -> str:
+    """A URDF of links in a row, one joint each."""
     body = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
-    links = [f'<link name="{name}">{body}</link>' for name in ("upper", "fore", "wrist_3_link")]
-    ends = [("base", "upper"), ("upper", "fore"), ("fore", "wrist_3_link")]
+    links = [f'<link name="{name}">{body}</link>' for name in names]
+    ends = list(zip(("base", *names), names, strict=False))
     joints = [
         f'<joint name="to_{child}" type="continuous"><origin xyz="0.3 0 0"/><axis xyz="0 1 0"/>'
         f'<parent link="{parent}"/><child link="{child}"/></joint>'
@@ -149,13 +149,16 @@ def three_joints() -> str:
 
 def test_code_of_bring_your_own_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("arm.urdf").write_text(three_joints(), encoding="utf-8")
+    Path("arm.urdf").write_text(
+        in_a_row("shoulder", "upper", "fore", "wrist_1", "wrist_2", "wrist_3_link"),
+        encoding="utf-8",
+    )
     asked: list[Any] = []
     monkeypatch.setattr(jaxid, "read", lambda *files, **given: asked.append(given))
     monkeypatch.setattr(jaxid, "fit", lambda loop, _: SimpleNamespace(loop=loop))
     monkeypatch.setattr(jaxid, "discover", lambda *args, **given: asked.append(given))
     text = (DOCS / "your-own.md").read_text(encoding="utf-8")
-    own: dict[str, Any] = {"jaxid": jaxid, "recordings": None, "G": np.eye(3)}
+    own: dict[str, Any] = {"jaxid": jaxid, "recordings": None}
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(block, own)
     assert set(asked[0]["columns"]) == {"time", "q", "tau"}
@@ -187,7 +190,7 @@ def test_every_law_of_the_docs_follows_its_reference(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("arm.urdf").write_text(three_joints(), encoding="utf-8")
+    Path("arm.urdf").write_text(in_a_row("upper", "fore", "wrist"), encoding="utf-8")
     own: dict[str, Any] = {}
     loops: list[jaxid.ClosedLoop] = []
     for block in blocks("laws.md"):
