@@ -59,6 +59,7 @@ from .robots import two_link as two_link  # noqa: E402
 from .signals.inspection import Inspection as Inspection  # noqa: E402
 from .signals.inspection import inspect as inspect  # noqa: E402
 from .signals.standstill import Standstill as Standstill  # noqa: E402
+from .simulation.feedforward import inverse_dynamics as inverse_dynamics  # noqa: E402
 from .simulation.loop import ClosedLoop as ClosedLoop  # noqa: E402
 from .simulation.runs import simulate as simulate  # noqa: E402
 from .simulation.stepping import Stepping as Stepping  # noqa: E402

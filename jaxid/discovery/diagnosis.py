@@ -18,6 +18,7 @@ from ..errors import FitError
 from ..estimate import Fit
 from ..noise import ARFilter
 from ..parameters import write_values
+from ..simulation.dynamics import imposed
 from ..storage.saved import save
 from .comparison import Comparison
 from .data import Data
@@ -105,7 +106,11 @@ class Diagnosis(AbstractShown):
 
     @property
     def adequate(self) -> bool:
-        """Whether no effect of the catalogue and no curve is significant."""
+        """Whether no effect of the catalogue and no curve is significant.
+
+        If the law is unknown, p-values assume that the recorded motion is exact; the noise of
+        encoders makes them too small.
+        """
         return all(v.p_value > self.significance for v in (*self.ranking, *self.where))
 
     def light(self) -> "Diagnosis":
@@ -364,6 +369,9 @@ class Diagnosis(AbstractShown):
     def __repr__(self) -> str:
         table = self.table().head(12)
         state = "nothing significant is missing" if self.adequate else "something is missing"
+        if not self.adequate and imposed(self.fit.loop):
+            # Encoder noise is in the residual and in the signatures, so p-values are too small.
+            state = "something is missing if the recorded motion is exact (discover tests more)"
         if isinstance(self.fit, Fit) and self.fit.mistake:
             # Effects would only approximate the mistake.
             state = f"{self.fit.mistake}; correct this first"

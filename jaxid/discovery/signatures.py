@@ -16,12 +16,12 @@ from ..parameters import Parameter, list_parameters, read_values, write_values
 from ..simulation.batch import Batch
 from ..simulation.loads import effect_loads
 from ..simulation.loop import ClosedLoop
+from ..simulation.own_states import settled_states
 from ..simulation.runs import each
 from ..simulation.sharing import at_once, one_by_one, taken
 from .finite import differences
 from .hypotheses import Hypothesis, amplitudes, free_of
 from .linear import Linearised, at_samples, respond
-from .own_states import settled_states
 
 Forces = tuple[
     Float[Array, "*points joints columns"],
