@@ -13,8 +13,7 @@ from jaxtyping import Float
 from ..display.shown import AbstractShown
 from ..errors import ModelError, RecordingError
 from ..estimate import Fit
-from ..estimate.refit import drawn_noise
-from ..noise import innovations, levels
+from ..estimate.refit import drawn_noise, noise_strengths
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from .comparison import Comparison, compare
@@ -278,11 +277,7 @@ def changes(
     # Rows at which a joint is at rest are zero and must remain zero.
     there = [(a != 0) | (b != 0) for a, b in zip(*rows, strict=True)]
     noise = noise_filters(near)
-    # The noise of the other rows is stronger than the mean over all of them.
-    strengths = [
-        level * np.sqrt(len(t) / np.maximum(t.sum(axis=0), 1))
-        for level, t in zip(levels([innovations(r, noise) for r in near]), there, strict=True)
-    ]
+    strengths = noise_strengths(near, noise)
     rng = np.random.default_rng(seed)
     made = drawn_noise(noise, [len(r) for r in near], draws, rng, strengths)
     found = []

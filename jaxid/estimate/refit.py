@@ -13,7 +13,7 @@ from ..compiling import compiled
 from ..display.progress import silent
 from ..errors import FitError
 from ..linear_algebra import solve
-from ..noise import ARFilter, VectorAR, fit_ar
+from ..noise import ARFilter, VectorAR, fit_ar, innovations, levels
 from .covariance import Optimum, optimum_of
 from .minimise import (
     BoundedDescent,
@@ -296,6 +296,21 @@ def _taps_by_draw(
             for rows in raw
         ]
     )
+
+
+def noise_strengths(
+    residuals: Sequence[Float[np.ndarray, "_samples outputs"]],
+    noise: tuple[ARFilter, ...] | VectorAR,
+) -> list[Float[np.ndarray, " outputs"]]:
+    """Noise level of each recording relative to that of a filter, for `drawn_noise`.
+
+    Samples that are not compared are zero, so the noise of the others is stronger than the mean.
+    """
+    there = [r != 0 for r in residuals]
+    relative = levels([innovations(r, noise) for r in residuals])
+    counts = [np.maximum(t.sum(axis=0), 1) for t in there]
+    pairs = zip(relative, there, counts, strict=True)
+    return [level * np.sqrt(len(t) / count) for level, t, count in pairs]
 
 
 def drawn_noise(

@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float
 from ..display.progress import working
 from ..display.shown import AbstractShown
 from ..errors import FitError
-from ..noise import ARFilter, VectorAR, fit_ar, innovations, levels
+from ..noise import ARFilter, VectorAR, centred, fit_ar
 from .covariance import optimum_of
-from .refit import drawn_noise, redrawn, refit_signals
+from .refit import drawn_noise, noise_strengths, redrawn, refit_signals
 from .result import Fit
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def bootstrap(fit: Fit, draws: int = 200, *, seed: int = 0, progress: bool = Tru
     lengths = [len(r) for r in fit.residuals]
     if len(lengths) != problem.batch.q.shape[0]:
         raise FitError("bootstrap needs whole recordings: fit without window")
-    strengths = levels([innovations(r, noise) for r in fit.residuals])
+    strengths = noise_strengths(fit.residuals, noise)
     made = drawn_noise(noise, lengths, draws, np.random.default_rng(seed), strengths)
     with working(f"bootstrap of {fit.loop.name}", progress) as say:
         found = refit_signals(fit, redrawn(fit, made), say=say)
@@ -118,7 +118,7 @@ def bootstrap(fit: Fit, draws: int = 200, *, seed: int = 0, progress: bool = Tru
 
 def residual_filters(fit: Fit) -> tuple[ARFilter, ...] | VectorAR:
     """AR filters of a fit's residuals."""
-    series = [[r[:, j] - r[:, j].mean() for r in fit.residuals] for j in range(fit.loop.joints)]
+    series = [[centred(r[:, j]) for r in fit.residuals] for j in range(fit.loop.joints)]
     if fit.optimum.problem.weights.shape[0] != fit.loop.joints:
         raise FitError("bootstrap needs one output per joint: fit torque or position, not both")
     return tuple(fit_ar(x) for x in series)
