@@ -162,7 +162,7 @@ def test_a_search_names_recordings_along_which_its_model_diverges(case: Any) -> 
     )
     assert story.verdict == "undetermined"
     assert "diverges when it is simulated along a held-out recording" in story.reason
-    assert any("fit_2 was left out of all fits" in note for note in story.notes)
+    assert any("all fits leave out fit_2" in note for note in story.notes)
     assert any("diverges when it is simulated along fit_2" in note for note in story.notes)
 
 

@@ -307,8 +307,8 @@ def _without_recordings(asked: Recordings, first: Fit) -> list[str]:
     if not gone:
         return []
     return [
-        f"{joined(gone)} was left out of all fits, because the simulation of the starting model "
-        "along it diverges: start from other values, or check this recording"
+        f"all fits leave out {joined(gone)}, because the simulation of the starting model diverges "
+        "there: start from other values, or check the recording"
     ]
 
 

@@ -160,7 +160,7 @@ class Fits:
             return refits.best([refits.filtered(x, noise) for x in (start, *plain)])
 
         # The same effects may be fitted again, from the values of another model.
-        values = np.array2string(np.asarray(start.theta), precision=6)
+        values = " ".join(f"{x:.6g}" for x in np.asarray(start.theta))
         mark = hashlib.sha256(values.encode()).hexdigest()[:12]
         name = f"{piece_name(effects)}, {'instead' if new else 'alone'}, from {mark}"
         return self._saved(name, loop, better)
