@@ -371,7 +371,7 @@ class Diagnosis(AbstractShown):
         state = "nothing significant is missing" if self.adequate else "something is missing"
         if not self.adequate and imposed(self.fit.loop):
             # Encoder noise is in the residual and in the signatures, so p-values are too small.
-            state = "something is missing if the recorded motion is exact (discover tests more)"
+            state = "something is missing, if the recorded motion is exact"
         if isinstance(self.fit, Fit) and self.fit.mistake:
             # Effects would only approximate the mistake.
             state = f"{self.fit.mistake}; correct this first"

@@ -131,10 +131,11 @@ def levelled(
     white = data.white(rows, noise)
     count = np.maximum(data.compared - np.array([f.order for f in noise]), 0)
     power = np.sum(white**2, axis=1) / np.maximum(count, 1)
-    mean = np.sum(count * power, axis=0) / np.maximum(count.sum(axis=0), 1)
+    total = np.maximum(count.sum(axis=0), 1)
+    mean = np.sum(count * power, axis=0) / total
     ratio = np.maximum(power / np.where(mean > 0, mean, 1.0), 1e-4)
     gain = -np.sum(count * np.log(ratio), axis=0)
-    differ = (mean > 0) & (gain > (len(ratio) - 1) * np.log(np.maximum(count.sum(axis=0), 1)))
+    differ = (mean > 0) & (gain > (len(ratio) - 1) * np.log(total))
     if not differ.any():
         return data, noise
     data = dataclasses.replace(data, level=np.sqrt(np.where(differ, ratio, 1.0)))

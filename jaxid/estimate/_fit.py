@@ -155,11 +155,13 @@ def _begun(loop: ClosedLoop, recordings: Recordings) -> list[str]:
 
 def _uncompared(found: Fit) -> list[str]:
     """Notes on joints that have no compared sample in a recording."""
+    windows = len(found.residuals) != len(found.recordings)
+    if windows or not found.loop.controller.imposes:
+        return []
     return [
         f"joint {j + 1} rests in almost all of {r.name}, so its torque is not compared there"
-        for r, rows in zip(found.recordings, found.residuals, strict=False)
+        for r, rows in zip(found.recordings, found.residuals, strict=True)
         for j in np.flatnonzero(~rows.any(axis=0))
-        if found.loop.controller.imposes
     ]
 
 

@@ -305,6 +305,10 @@ def noise_strengths(
     """Noise level of each recording relative to that of a filter, for `drawn_noise`.
 
     Samples that are not compared are zero, so the noise of the others is stronger than the mean.
+
+    **Arguments:**
+
+    - `residuals`: `(samples, outputs)` of each recording. `noise`: their filters.
     """
     there = [r != 0 for r in residuals]
     relative = levels([innovations(r, noise) for r in residuals])
