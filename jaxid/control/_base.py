@@ -149,6 +149,12 @@ class AbstractController(eqx.Module):
         """The controller with settings taken from the fitted recordings, for use on others."""
         return self
 
+    def smoothed(
+        self, recording: Recording, q: Float[np.ndarray, "samples joints"]
+    ) -> Float[np.ndarray, "samples joints"]:
+        """Positions as the law takes them from a recording, rad or m; unchanged by default."""
+        return q
+
     def signals(self, recording: Recording) -> Signals:
         """Reference and known torque, taken from a recording.
 

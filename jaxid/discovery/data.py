@@ -48,9 +48,14 @@ class Data(eqx.Module):
     known: Prior | None = None
 
     @property
+    def there(self) -> Bool[np.ndarray, "recordings samples outputs"]:
+        """Rows that are compared; those at which a joint is at rest are zero and are not."""
+        return self.residual != 0
+
+    @property
     def compared(self) -> Int[np.ndarray, "recordings outputs"]:
-        """Number of compared rows; rows at which a joint is at rest are zero and do not count."""
-        return np.count_nonzero(self.residual, axis=1)
+        """Number of compared rows."""
+        return self.there.sum(axis=1)
 
     def columns(
         self, numbers: Sequence[int]
@@ -75,7 +80,7 @@ class Data(eqx.Module):
         self, x: Float[np.ndarray, "recordings samples outputs *columns"], noise: Sequence[ARFilter]
     ) -> Float[np.ndarray, "recordings samples outputs *columns"]:
         """Rows through the inverse of the noise filters, scaled to a common noise level."""
-        out = whitened(x, noise, self.mask)
+        out = whitened(x, noise, self.there)
         if self.level is not None:
             level = self.level.astype(x.dtype)[:, None]
             out /= level.reshape(*level.shape, *(1,) * (x.ndim - 3))
@@ -122,7 +127,8 @@ class Data(eqx.Module):
         """The whitened signatures of one output, and the numbers of those that are not zero."""
         own = self.table[:, :, output]
         columns = np.flatnonzero(own.any(axis=(0, 1)))
-        white = whitened(own.take(columns, axis=2)[:, :, None], [noise], self.mask)
+        there = self.there[..., output, None]
+        white = whitened(own.take(columns, axis=2)[:, :, None], [noise], there)
         if self.level is not None:
             white /= self.level[:, output, None, None, None].astype(white.dtype)
         return white.reshape(-1, len(columns)), columns
@@ -168,44 +174,17 @@ class Data(eqx.Module):
 def whitened(
     x: Float[np.ndarray, "recordings samples outputs *columns"],
     noise: Sequence[ARFilter],
-    mask: Bool[np.ndarray, "recordings samples"],
+    there: Bool[np.ndarray, "recordings samples outputs"],
 ) -> Float[np.ndarray, "recordings samples outputs *columns"]:
-    """Each output through its noise filter's inverse and over its innovations' deviation."""
+    """Each output through its noise filter's inverse and over its innovations' deviation.
+
+    **Arguments:**
+
+    - `there`: rows that are compared; others become zero.
+    """
     out = np.empty_like(x)
     for j, filt in enumerate(noise):
         level = np.sqrt(filt.variance) if filt.variance > 0 else 1.0
-        taps = (filt.polynomial / level).astype(x.dtype)
-        for k, there in enumerate(mask):
-            wide = x[k, :, j].reshape(x.shape[1], -1)
-            out[k, :, j] = _through(taps, wide).reshape(out[k, :, j].shape)
-            # The past of the first samples is unknown. With zeros the first rows would be outliers,
-            # which any signature that starts with a step could explain.
-            out[k, : int(np.argmax(there)) + filt.order, j] = 0.0
-    out[~mask] = 0.0
-    return out
-
-
-def _through(
-    taps: Float[np.ndarray, " taps"], x: Float[np.ndarray, "samples columns"]
-) -> Float[np.ndarray, "samples columns"]:
-    """Moving average along the samples, as products with one banded matrix; zero before the first.
-
-    SciPy's `lfilter` needs one convolution per column and is five times as slow for a thousand.
-    """
-    import scipy
-
-    reach = int(np.flatnonzero(taps).max(initial=0))
-    if reach == 0:
-        return taps[0] * x
-    # Of a band as wide as it is high half is zeros; a lower one would be too many products.
-    size, taps = max(32, reach), taps[: reach + 1]
-    row = np.concatenate([taps[::-1], np.zeros(size - 1, taps.dtype)])
-    band = scipy.linalg.toeplitz(np.concatenate([taps[-1:], np.zeros(size - 1, taps.dtype)]), row)
-    out = np.empty_like(x)
-    for at in range(0, len(x), size):
-        first = max(at - reach, 0)
-        piece = x[first : at + size]
-        missing = first - (at - reach)
-        rows = min(size, len(x) - at)
-        out[at : at + size] = band[:rows, missing : missing + len(piece)] @ piece
+        for k, kept in enumerate(there[..., j]):
+            out[k, :, j] = filt.innovations(x[k, :, j], kept) / x.dtype.type(level)
     return out

@@ -18,7 +18,6 @@ from ..errors import FitError
 from ..estimate import Fit
 from ..noise import ARFilter
 from ..parameters import write_values
-from ..simulation.dynamics import imposed
 from ..storage.saved import save
 from .comparison import Comparison
 from .data import Data
@@ -36,7 +35,9 @@ class Verdict(eqx.Module):
     """How much one hypothesis, at its best setting, explains.
 
     `evidence` is the reduction of the whitened squared error, minus log(samples) for each amplitude
-    (twice the logarithm of the odds, as in BIC); `p_value` is corrected for all tests.
+    (twice the logarithm of the odds, as in BIC); `p_value` is corrected for all tests. Along a
+    recorded motion both are corrected for its noise, and `wider` is the variance of the score over
+    that with an exact motion.
     """
 
     hypothesis: Hypothesis
@@ -45,6 +46,7 @@ class Verdict(eqx.Module):
     freedom: int
     p_value: float
     possible: bool
+    wider: float = 1.0
 
     @property
     def key(self) -> tuple[str, int | None]:
@@ -106,11 +108,7 @@ class Diagnosis(AbstractShown):
 
     @property
     def adequate(self) -> bool:
-        """Whether no effect of the catalogue and no curve is significant.
-
-        If the law is unknown, p-values assume that the recorded motion is exact; the noise of
-        encoders makes them too small.
-        """
+        """Whether no effect of the catalogue and no curve is significant."""
         return all(v.p_value > self.significance for v in (*self.ranking, *self.where))
 
     def light(self) -> "Diagnosis":
@@ -161,7 +159,7 @@ class Diagnosis(AbstractShown):
     def amplitude(self, verdict: Verdict) -> tuple[np.ndarray, np.ndarray]:
         """Predicted amplitudes and standard deviations, in the units of the effect's parameters."""
         values, covariance = self.gram.amplitude(verdict.hypothesis.columns)
-        return values, np.sqrt(np.diag(covariance))
+        return values, np.sqrt(verdict.wider * np.diag(covariance))
 
     def predicted_error(self, verdict: Verdict) -> Float[np.ndarray, " joints"]:
         """Relative error on the fitted recordings that adding the effect would leave, %."""
@@ -369,9 +367,7 @@ class Diagnosis(AbstractShown):
     def __repr__(self) -> str:
         table = self.table().head(12)
         state = "nothing significant is missing" if self.adequate else "something is missing"
-        if not self.adequate and imposed(self.fit.loop):
-            # Encoder noise is in the residual and in the signatures, so p-values are too small.
-            state = "something is missing, if the recorded motion is exact"
+
         if isinstance(self.fit, Fit) and self.fit.mistake:
             # Effects would only approximate the mistake.
             state = f"{self.fit.mistake}; correct this first"

@@ -215,7 +215,8 @@ def _separations(
         if not np.isfinite(seen[k]).all() or np.any(np.abs(tau) > 1.05 * limits.torque):
             continue
         data = Data(
-            residual=np.zeros((1, *base.shape[1:3])),
+            # Only the signatures matter, but a row without a residual counts as not compared.
+            residual=np.ones((1, *base.shape[1:3])) * kept[k : k + 1, :, None],
             base=base[k : k + 1],
             table=rows[k : k + 1],
             mask=kept[k : k + 1],

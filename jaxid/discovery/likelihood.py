@@ -85,9 +85,10 @@ def _scored(series: Sequence[Sequence[np.ndarray]], freedom: int, paid: float) -
         # The mean is not subtracted: the model must explain it.
         found = filter_of(rows, _HIGHEST)
         size = np.array([np.count_nonzero(s) for s in rows])
+        value += sum(found.starts(s != 0) for s in rows)
         # Each recording has its own noise level if that lowers the score.
-        power = np.array([np.sum(found.whiten(s)[found.order :] ** 2) for s in rows])
-        power = np.maximum(power / np.maximum(size - found.order, 1), 1e-300)
+        power = np.array([np.sum(found.innovations(s, s != 0) ** 2) for s in rows])
+        power = np.maximum(power / np.maximum(size, 1), 1e-300)
         mean = max(float(size @ power) / max(size.sum(), 1), 1e-300)
         apart = float(size @ np.log(power)) + (len(rows) - 1) * math.log(total)
         value += min(size.sum() * math.log(mean), apart)

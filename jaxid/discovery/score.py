@@ -71,9 +71,7 @@ class Whitened(eqx.Module):
         size = np.sqrt(np.where(power > 0, power, 1.0))
         for part in parts:
             part.values[...] /= size[part.columns].astype(part.values.dtype)
-        unknown = len(data.mask) * sum(f.order for f in noise)
-        rows = data.compared.sum() + len(data.known_left())
-        count = rows - unknown - basis.shape[1]
+        count = data.compared.sum() + len(data.known_left()) - basis.shape[1]
         across = _products(parts, basis.astype(data.table.dtype), len(size))
         return cls(r, parts, basis, across, size, float(count))
 

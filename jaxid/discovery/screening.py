@@ -59,7 +59,7 @@ def diagnose(
             "were simulated with this model: a diagnosis is not possible"
         )
     with working(f"diagnosis of {fit.loop.name}", progress) as say:
-        return judge(fit, screen(fit, catalogue, say), significance)
+        return judge(fit, screen(fit, catalogue, say), significance, say)
 
 
 def screen(fit: Fit | Comparison, catalogue: Sequence[Any], say: Callable[[str], None]) -> Screened:

@@ -92,7 +92,7 @@ def noise_of(data: Data, rows: Rows, lost: float, highest: int = 30) -> tuple[AR
         series = [centred(s) for s in data.series(rows, j)]
         found = filter_of(series, highest)
         free = max(counted[j] - lost / outputs, counted[j] / 2, 1)
-        variance = found.variance * data.mask.sum() / free
+        variance = found.variance * counted[j] / free
         filters.append(ARFilter(found.coefficients, max(variance, 1e-300)))
     return tuple(filters)
 
@@ -129,7 +129,7 @@ def levelled(
     if alike:
         return data, noise
     white = data.white(rows, noise)
-    count = np.maximum(data.compared - np.array([f.order for f in noise]), 0)
+    count = data.compared
     power = np.sum(white**2, axis=1) / np.maximum(count, 1)
     total = np.maximum(count.sum(axis=0), 1)
     mean = np.sum(count * power, axis=0) / total
@@ -172,7 +172,7 @@ def select(white: Whitened, blocks: Blocks, most: int = 12, margin: float = 10.0
     grouped = [(places, columns, white.within(columns)) for places, columns in by_width(blocks)]
     residual, taken = white.residual, np.zeros((len(white.residual), 0))
     chosen: list[int] = []
-    for _ in range(most):
+    for _ in range(min(most, len(blocks))):
         gain = np.full(len(blocks), -np.inf)
         for places, columns, inner in grouped:
             value, freedom = explained_by(inner, score[columns][..., None])

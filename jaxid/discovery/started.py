@@ -98,7 +98,7 @@ class Started(Examined):
         """The linear system at a fit with its signatures, and the diagnosis, which is stored."""
         self.watched.begin("screen", "where the model fails")
         screened = known or screen(fit, self.asked.catalogue, self.watched.say)
-        diagnosis = judge(fit, screened, self.asked.significance)
+        diagnosis = judge(fit, screened, self.asked.significance, self.watched.say)
         self.forms = max(self.forms, forms_of(screened.hypotheses))
         self.diagnoses[key_of(effects)] = diagnosis.light()
         return screened, diagnosis

@@ -1,6 +1,7 @@
 """The linear system of a fitted loop along its recordings, on which effects act."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from ..estimate.prior import prior_of
 from ..simulation.batch import Batch, prepare
 from ..simulation.integration import SIGNALS
 from ..simulation.loop import ClosedLoop
+from ..simulation.perturbed import with_errors
 from ..simulation.steps import with_substeps
 from .comparison import Comparison
 from .linear import Linearised, at_samples, base_columns, linearise, sampled
@@ -44,13 +46,24 @@ class System(eqx.Module):
     prior: Prior | None = None
 
     @classmethod
-    def of(cls, fit: Fit | Comparison) -> "System":
+    def of(
+        cls,
+        fit: Fit | Comparison,
+        errors: Sequence[Float[np.ndarray, "_samples joints"]] | None = None,
+    ) -> "System":
         """The system of a fitted loop.
+
+        **Arguments:**
+
+        - `errors`: added to a motion that is imposed, by piece of the recordings, rad or m.
 
         **Raises:** `FitError` if the loop cannot be simulated.
         """
         loop = with_substeps(fit.loop, fit.recordings)
         output, batch, free = _as_fitted(fit, loop)
+        if errors is not None:
+            pieces = pieces_of(fit.recordings, oem_of(fit).window)
+            batch = with_errors(loop, pieces, batch, errors)
         linear = linearise(loop, batch, output)
         row = SIGNALS.index(output)
         residual, base = _residual_and_base(batch, linear, loop, output, free)

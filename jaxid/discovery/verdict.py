@@ -301,7 +301,7 @@ def _power(filt: ARFilter, rest: Float[np.ndarray, " samples"]) -> float:
     The level is the median over frequencies. A missing effect hardly changes the median, because it
     is slow and concerns few frequencies.
     """
-    white = filt.whiten(rest)[filt.order :]
+    white = filt.innovations(rest, rest != 0)
     spectrum = np.abs(np.fft.rfft(white)[1:]) ** 2 / len(white)
     return float(np.median(spectrum) / np.log(2) * filt.gain)
 

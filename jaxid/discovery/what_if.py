@@ -236,8 +236,9 @@ def _weights(fit: Fit, system: System) -> tuple[ARFilter, ...]:
     noise = (ARFilter(np.zeros(0), 1.0),) * outputs
     if isinstance(fit.noise, tuple) and len(fit.noise) == outputs:
         noise = tuple(ARFilter(f.coefficients, 1.0) for f in fit.noise)
-    rows = whitened(system.residual, noise, system.mask)[system.mask]
-    power = np.mean(rows**2, axis=0)
+    there = system.residual != 0
+    rows = whitened(system.residual, noise, there)
+    power = np.sum(rows**2, axis=(0, 1)) / np.maximum(there.sum(axis=(0, 1)), 1)
     return tuple(
         ARFilter(f.coefficients, float(max(x, 1e-300))) for f, x in zip(noise, power, strict=True)
     )

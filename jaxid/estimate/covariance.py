@@ -185,24 +185,26 @@ def score_covariance(
     meat, inverse = np.zeros((p, p)), np.linalg.pinv(information / units, hermitian=True) / units
     for o in range(outputs):
         series = [centred(r[:, o]) for r in residuals]
-        strengths = [float(np.sqrt(np.mean(x**2))) or 1.0 for x in series]
-        # Rows at which a joint is at rest are zero, so the noise of the others is stronger.
-        shares = [max(np.count_nonzero(x), 1) / len(x) for x in series]
+        # Rows at which a joint is at rest are zero, and do not count.
+        sizes = [max(np.count_nonzero(x), 1) for x in series]
+        strengths = [
+            float(np.sqrt(x @ x / size)) or 1.0 for x, size in zip(series, sizes, strict=True)
+        ]
         # Low-passed residuals have almost no power above the cutoff, which makes a fitted filter
         # ill-conditioned: a white floor at -100 dB keeps it stable.
         floor = np.random.default_rng(0)
         noise = fit_ar(
             [
-                x / strength + 1e-5 * floor.standard_normal(len(x))
+                x / strength + 1e-5 * floor.standard_normal(len(x)) * (x != 0)
                 for x, strength in zip(series, strengths, strict=True)
             ]
         )
-        for j, strength, share in zip(jacobians, strengths, shares, strict=True):
+        for j, strength in zip(jacobians, strengths, strict=True):
             size = 1 << int(np.ceil(np.log2(2 * j.shape[0])))
             wave = np.fft.fft(j[:, o], size, axis=0)
             leverage = np.real(np.einsum("fp,pq,fq->f", wave.conj(), inverse, wave)) / j.shape[0]
             kept = np.maximum(1 - leverage, _KEPT)
-            power = (strength**2 / share * noise.spectrum(size) / kept)[:, None]
+            power = (strength**2 * noise.spectrum(size) / kept)[:, None]
             meat += np.real(wave.conj().T @ (power * wave)) / size
     return meat
 

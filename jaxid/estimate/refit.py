@@ -310,11 +310,7 @@ def noise_strengths(
 
     - `residuals`: `(samples, outputs)` of each recording. `noise`: their filters.
     """
-    there = [r != 0 for r in residuals]
-    relative = levels([innovations(r, noise) for r in residuals])
-    counts = [np.maximum(t.sum(axis=0), 1) for t in there]
-    pairs = zip(relative, there, counts, strict=True)
-    return [level * np.sqrt(len(t) / count) for level, t, count in pairs]
+    return levels([innovations(r, noise) * (r != 0) for r in residuals])
 
 
 def drawn_noise(

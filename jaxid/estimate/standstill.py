@@ -17,8 +17,9 @@ from .result import Fit, Status
 # Factor on the share of the highest speed, the largest share (more would leave out motion), and the
 # largest reach in periods of the cutoff.
 _FACTOR, _LARGEST, _FARTHEST = 3.0, 0.1, 2.0
-# Ratio of mean squares above which samples are left out.
-_LARGER = 2.0
+# Ratio of mean squares above which samples are left out. A friction curve or presliding, which the
+# curves below describe only approximately, leaves up to 2.2; a joint that sticks, 16 and more.
+_LARGER = 3.0
 # Smallest number of samples that are worth leaving out, and for the coefficients below.
 _FEW = 80
 # Knots of a friction curve in multiples of the speed of standstill, and of presliding in multiples

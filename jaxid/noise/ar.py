@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..errors import NoiseError
+from .stretches import depths, predictors, through
 from .whiteness import levelled, ljung_box
 
 if TYPE_CHECKING:
@@ -88,6 +89,34 @@ class ARFilter(eqx.Module):
             scipy.signal.lfilter(self.polynomial, [1.0], np.asarray(x, float), axis=0)
         )
 
+    def innovations(
+        self,
+        x: Float[np.ndarray, "samples *axes"],
+        there: Bool[np.ndarray, " samples"],
+    ) -> Float[np.ndarray, "samples *axes"]:
+        """Prediction errors of x within stretches, each in units of its deviation over that of e.
+
+        The first samples of a stretch are predicted from those before them in the stretch, which
+        are fewer than the order. Prediction errors of noise of this filter are therefore white from
+        the first sample on.
+
+        **Arguments:**
+
+        - `there`: samples that are compared; the errors of others are zero.
+        """
+        taps, spread = predictors(self.stabilised().reflection)
+        wide = x.reshape(len(x), -1)
+        return through(taps / spread[:, None], wide, depths(there)).reshape(x.shape)
+
+    def starts(self, there: Bool[np.ndarray, " samples"]) -> float:
+        """Sum of the logarithms of the variances of `innovations` over that of e.
+
+        Only the first samples of stretches contribute.
+        """
+        depth = depths(there)
+        _, spread = predictors(self.stabilised().reflection)
+        return float(2 * np.sum(np.log(spread[np.minimum(depth[depth >= 0], self.order)])))
+
     def stabilised(self) -> "ARFilter":
         """The stable filter with the same spectrum: poles are reflected into the unit circle."""
         if self.stable:
@@ -129,8 +158,9 @@ class ARFilter(eqx.Module):
             return self
         inside = poles * np.minimum(1.0, longest / np.maximum(np.abs(poles), 1e-12))
         changed = ARFilter(np.real(np.poly(inside))[1:], self.variance)
-        left = np.concatenate([changed.whiten(x)[self.order :] for x in series])
-        return ARFilter(changed.coefficients, float(np.mean(left**2)))
+        left = sum(float(np.sum(changed.innovations(x, x != 0) ** 2)) for x in series)
+        count = max(sum(map(np.count_nonzero, series)), 1)
+        return ARFilter(changed.coefficients, left / count)
 
     def taps(self, size: int) -> Float[np.ndarray, " size"]:
         """The polynomial padded with zeros."""
@@ -187,11 +217,11 @@ def fit_ar(
     """The AR filter of one joint's residuals over several recordings, by Burg's method.
 
     The filter is stable, because every reflection coefficient is below one. Products across the
-    ends of recordings are left out.
+    ends of recordings, and across samples that are not compared, are left out.
 
     **Arguments:**
 
-    - `series`: residuals, `(samples,)` each.
+    - `series`: residuals, `(samples,)` each; zero where they are not compared.
     - `order`: number of coefficients; None to choose it by `criterion` over 0..`highest`.
     - `white`: significance of Ljung and Box's test of the innovations, by which orders are
       rejected (see `orders`); None for no test.
@@ -202,7 +232,7 @@ def fit_ar(
         check_series(series, order, "this series")
     most = highest if order is None else order
     if order is None:
-        most = max(0, min(most, min(len(x) for x in series) // 3))
+        most = min(most, _highest(series))
     burg = Burg.of(series, most)
     if burg.variances[0] <= 0:
         return ARFilter(np.zeros(0), 0.0)
@@ -223,8 +253,18 @@ def orders(
     - `lags`: of Ljung and Box's test; at least twenty beyond each order.
     """
     check_series(series, 0, "this series")
-    most = max(0, min(highest, min(len(x) for x in series) // 3))
-    return Burg.of(series, most).orders(True, lags)
+    return Burg.of(series, min(highest, _highest(series))).orders(True, lags)
+
+
+# Smallest share of the samples that have as many before them in their stretch as the order.
+_WITH_PAST = 2 / 3
+
+
+def _highest(series: Sequence[Float[np.ndarray, " _"]]) -> int:
+    """The highest order that enough samples of these series determine."""
+    depth = np.concatenate([depths(x != 0) for x in series])
+    depth = np.sort(depth[depth >= 0])
+    return int(depth[int((1 - _WITH_PAST) * len(depth))]) if len(depth) else 0
 
 
 def choose(table: "pd.DataFrame", criterion: Criterion, white: float | None = None) -> int:
@@ -260,12 +300,18 @@ class Burg(eqx.Module):
         """Filters of orders 0..`most`, each recording in units of its own noise level."""
         forward = levelled([np.asarray(x, dtype=float) for x in series])
         backward = list(forward)
+        past = [depths(x != 0) for x in forward]
         a = np.ones(1)
-        count = sum(len(x) for x in forward)
+        count = max(int(sum(map(np.count_nonzero, forward))), 1)
         variances = [sum(float(x @ x) for x in forward) / count]
         found, innovations = [np.zeros(0)], [list(forward)]
-        for _ in range(most):
-            pairs = [(f[1:], b[:-1]) for f, b in zip(forward, backward, strict=True)]
+        for order in range(1, most + 1):
+            # Errors of samples with fewer before them in their stretch do not enter the products.
+            kept = [depth[order:] >= order for depth in past]
+            pairs = [
+                (f[1:] * there, b[:-1] * there)
+                for f, b, there in zip(forward, backward, kept, strict=True)
+            ]
             power = sum(float(f @ f + b @ b) for f, b in pairs)
             k = -2 * sum(float(f @ b) for f, b in pairs) / power if power > 0 else 0.0
             forward = [f + k * b for f, b in pairs]

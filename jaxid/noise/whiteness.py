@@ -44,11 +44,18 @@ def levelled(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]
 
 
 def levels(series: Sequence[Float[np.ndarray, "_ *axes"]]) -> list[np.ndarray]:
-    """Noise level of each series relative to the overall level; one for a series of zeros."""
+    """Noise level of each series relative to the overall level; one for a series of zeros.
+
+    Samples that are not compared are zero, and do not count.
+    """
+    sizes = [np.maximum(np.count_nonzero(x, axis=0), 1) for x in series]
     # The residual of a fit that diverges may overflow.
     with np.errstate(over="ignore", invalid="ignore"):
-        power = [np.asarray(np.mean(np.square(x), axis=0)) for x in series]
-        pooled = sum(len(x) * p for x, p in zip(series, power, strict=True)) / sum(map(len, series))
+        power = [
+            np.asarray(np.sum(np.square(x), axis=0) / size)
+            for x, size in zip(series, sizes, strict=True)
+        ]
+        pooled = sum(s * p for s, p in zip(sizes, power, strict=True)) / sum(sizes)
         ratio = [np.where(p > 0, p, 1.0) / np.where(p > 0, pooled, 1.0) for p in power]
     return [np.asarray(np.sqrt(r)) for r in ratio]
 

@@ -10,7 +10,7 @@ from ..discovery.diagnosis import Verdict
 from ..display import figures
 from ..effects import Curve
 from ..effects.curve import coordinate_unit
-from ..noise import autocorrelation
+from ..noise import autocorrelation, centred
 from ._beside import Beside
 from ._html import Content, Markup, breakable, cell, figure, join, section, table, tag
 from ._models import where_table
@@ -129,12 +129,9 @@ def _failures(beside: Beside) -> list[list[Content]]:
 def _outside(beside: Beside, residual: np.ndarray) -> list[int]:
     """How many autocorrelations of each joint's innovations are out of their bounds."""
     filters = beside.story.diagnosis.noise
-    mask = np.ones((1, len(residual)), bool)
-    # The filter has no past samples for its first rows, which are zero.
-    start = max(filt.order for filt in filters)
     counts = []
-    for column in whitened(residual[None], filters, mask)[0, start:].T:
-        acf, bound = autocorrelation([column - column.mean()], LAGS)
+    for column in whitened(residual[None], filters, residual[None] != 0)[0].T:
+        acf, bound = autocorrelation([centred(column)], LAGS)
         counts.append(int(np.sum(np.abs(acf[1:]) > bound)))
     return counts
 

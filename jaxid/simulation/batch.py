@@ -144,9 +144,9 @@ def _drive(
     """The fields of the intervals of one recording, each padded to `length` points."""
     grid, ticks = points
     signals = loop.controller.signals(recording)
-    kind, torque_kind = loop.stepping.interpolation, "linear"
-    if signals.hold:
-        kind = torque_kind = "hold"
+    kind = torque_kind = "hold"
+    if not signals.hold:
+        kind, torque_kind = loop.stepping.interpolation, "linear"
     pad = length - len(grid)
 
     def padded(values: np.ndarray) -> np.ndarray:
@@ -168,6 +168,19 @@ def _drive(
         ends,
         rate,
     )
+
+
+def reference_at(
+    loop: ClosedLoop, recording: Recording, q: Float[np.ndarray, "samples joints"]
+) -> Float[np.ndarray, "points 4 joints"]:
+    """The cubics of a reference in the intervals of a recording, before padding.
+
+    **Arguments:**
+
+    - `q`: the reference at the samples, rad or m.
+    """
+    grid, _ = _grid(recording, loop.controller.period)
+    return _pieces(recording.time, q, grid, loop.stepping.interpolation, 3)
 
 
 def held_names(recordings: Recordings | Sequence[Recording]) -> tuple[str, ...]:

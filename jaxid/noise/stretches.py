@@ -1,0 +1,68 @@
+"""Prediction within stretches of a series: samples in between are not compared."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+# Rows of the matrix of a filter that are multiplied at once.
+_ROWS = 32
+
+
+def depths(there: Bool[np.ndarray, " samples"]) -> Int[np.ndarray, " samples"]:
+    """The number of samples of its stretch before each sample; -1 for samples that are not there.
+
+    **Arguments:**
+
+    - `there`: whether a sample is compared.
+    """
+    number = np.arange(len(there))
+    last = np.maximum.accumulate(np.where(there, -1, number))
+    return number - last - 1
+
+
+def predictors(
+    reflection: Float[np.ndarray, " order"],
+) -> tuple[Float[np.ndarray, "depths lags"], Float[np.ndarray, " depths"]]:
+    """Prediction errors from 0, 1, … past samples of stationary noise (Levinson 1947).
+
+    **Arguments:**
+
+    - `reflection`: reflection coefficients of the filter.
+
+    **Returns:** for each number of past samples the coefficients of the prediction error, and its
+    deviation over that of the whole filter.
+    """
+    order = len(reflection)
+    taps, a = np.zeros((order + 1, order + 1)), np.ones(1)
+    taps[0, 0] = 1.0
+    for depth, k in enumerate(reflection, start=1):
+        a = np.append(a, 0.0)
+        a = a + k * a[::-1]
+        taps[depth, : depth + 1] = a
+    left = np.append(np.cumprod((1 - reflection**2)[::-1])[::-1], 1.0)
+    return taps, 1 / np.sqrt(left)
+
+
+def through(
+    taps: Float[np.ndarray, "depths lags"],
+    x: Float[np.ndarray, "samples columns"],
+    depth: Int[np.ndarray, " samples"],
+) -> Float[np.ndarray, "samples columns"]:
+    """Moving averages along the samples, with the coefficients of the depth of each.
+
+    They are products with a banded matrix. SciPy's `lfilter` has the same coefficients for all
+    samples, needs one convolution per column, and is five times as slow for a thousand.
+    """
+    reach = taps.shape[1] - 1
+    chosen = np.where(depth[:, None] >= 0, taps[np.clip(depth, 0, reach)], 0.0).astype(x.dtype)
+    if reach == 0:
+        return chosen * x
+    # Of a band as wide as it is high half is zeros; a lower one would be too many products.
+    size, out = max(_ROWS, reach), np.empty_like(x)
+    for at in range(0, len(x), size):
+        first, own = max(at - reach, 0), chosen[at : at + size]
+        rows = np.arange(at, at + len(own))[:, None]
+        lag = rows - np.arange(first, at + len(own))
+        inside = (lag >= 0) & (lag <= reach)
+        band = np.where(inside, np.take_along_axis(own, np.clip(lag, 0, reach), axis=1), 0)
+        out[at : at + size] = band @ x[first : at + len(own)]
+    return out
