@@ -206,3 +206,38 @@ def test_the_level_of_a_residual_that_overflows_gives_no_warning():
         huge, usual = levels([np.full((5, 1), 1e200), np.ones((5, 1))])
     assert not np.isfinite(huge).any()
     assert usual == 0.0
+
+
+def in_stretches(x, every=60, absent=17):
+    """A series of which pieces are not compared, and the samples that are."""
+    there = np.arange(len(x)) % every >= absent
+    return np.where(there, x, 0.0), there
+
+
+def test_innovations_in_stretches_give_the_likelihood_of_each():
+    x, there = in_stretches(FOURTH.simulate((2000,), np.random.default_rng(20)))
+    e = FOURTH.innovations(x, there)
+    assert np.all(e[~there] == 0.0)
+    lags = np.fft.ifft(spectrum_of(FOURTH, 1 << 14)).real
+    expected, at = 0.0, np.flatnonzero(there)
+    for one in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1):
+        covariance = linalg.toeplitz(lags[: len(one)])
+        expected += np.linalg.slogdet(covariance)[1]
+        expected += x[one] @ np.linalg.solve(covariance, x[one])
+    found = there.sum() * np.log(FOURTH.variance) + FOURTH.starts(there)
+    assert found + np.sum(e**2) / FOURTH.variance == pytest.approx(expected, rel=1e-6)
+    both = FOURTH.innovations(np.stack([x, 2 * x], axis=1), there)
+    np.testing.assert_allclose(both, np.stack([e, 2 * e], axis=1))
+
+
+def test_burg_leaves_out_samples_that_are_not_compared():
+    rng = np.random.default_rng(21)
+    runs = [in_stretches(x)[0] for x in FOURTH.simulate((20, 3000), rng)]
+    found = [fit_ar([x], criterion="bic") for x in runs]
+    assert np.mean([f.order == 4 for f in found]) > 0.8
+    at_fourth = np.array([fit_ar([x], 4).coefficients for x in runs])
+    error = at_fourth.std(axis=0) / np.sqrt(len(runs))
+    assert np.all(np.abs(at_fourth.mean(axis=0) - FOURTH.coefficients) < 4 * error)
+    assert np.mean([f.variance for f in found]) == pytest.approx(FOURTH.variance, rel=0.05)
+    # Stretches that are too short do not determine a long filter.
+    assert fit_ar([in_stretches(runs[0], every=6, absent=2)[0]], criterion="aic").order <= 1

@@ -52,17 +52,25 @@ def through(
     They are products with a banded matrix. SciPy's `lfilter` has the same coefficients for all
     samples, needs one convolution per column, and is five times as slow for a thousand.
     """
-    reach = taps.shape[1] - 1
-    chosen = np.where(depth[:, None] >= 0, taps[np.clip(depth, 0, reach)], 0.0).astype(x.dtype)
+    taps, reach = taps.astype(x.dtype), taps.shape[1] - 1
     if reach == 0:
-        return chosen * x
+        return np.where(depth[:, None] >= 0, taps[0] * x, 0)
     # Of a band as wide as it is high half is zeros; a lower one would be too many products.
     size, out = max(_ROWS, reach), np.empty_like(x)
+    usual = _band(taps, np.full(size, reach))
     for at in range(0, len(x), size):
-        first, own = max(at - reach, 0), chosen[at : at + size]
-        rows = np.arange(at, at + len(own))[:, None]
-        lag = rows - np.arange(first, at + len(own))
-        inside = (lag >= 0) & (lag <= reach)
-        band = np.where(inside, np.take_along_axis(own, np.clip(lag, 0, reach), axis=1), 0)
-        out[at : at + size] = band @ x[first : at + len(own)]
+        own = depth[at : at + size]
+        band = usual[: len(own)] if np.all(own >= reach) else _band(taps, own)
+        first = max(at - reach, 0)
+        out[at : at + size] = band[:, first - at + reach : len(own) + reach] @ x[first : at + size]
     return out
+
+
+def _band(
+    taps: Float[np.ndarray, "depths lags"], depth: Int[np.ndarray, " rows"]
+) -> Float[np.ndarray, "rows columns"]:
+    """The matrix from some rows and as many rows before them as the order to the predictions."""
+    reach = taps.shape[1] - 1
+    lag = np.arange(len(depth))[:, None] + reach - np.arange(len(depth) + reach)
+    chosen = taps[np.clip(depth, 0, reach)[:, None], np.clip(lag, 0, reach)]
+    return np.where((depth[:, None] >= 0) & (lag >= 0) & (lag <= reach), chosen, 0)

@@ -14,9 +14,9 @@ from ..recording import Recording
 ORDER = 4
 # Samples per period of the cutoff; at their Nyquist frequency the filter's gain is a sixth.
 _SAMPLES = 2.5
-# Periods of the cutoff at each end that are not compared. The acceleration is wrong at the ends, and
-# after three periods the filter leaves a thousandth of its torque. After two it is a hundredth, which
-# was nineteen times the innovation of slow noise.
+# Periods of the cutoff at each end that are not compared. The acceleration is wrong at the ends;
+# after three periods the filter leaves a thousandth of its torque. After two it leaves a hundredth,
+# which was nineteen times the innovation of slow noise.
 _ENDS = 3
 
 

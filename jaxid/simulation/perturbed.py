@@ -1,8 +1,8 @@
 """Recorded motions with errors, along which a loop with an imposed motion is simulated."""
 
-import dataclasses
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -31,7 +31,5 @@ def with_errors(
         added = reference_at(loop, recording, law.smoothed(recording, error))
         reference[k, : len(added)] += added
         reference[k, len(added) :] += added[-1]
-    start = reference[:, 0, :2]
-    intervals = dataclasses.replace(batch.intervals, reference=jax.device_put(reference))
-    q0, v0 = jax.device_put(start[:, 0]), jax.device_put(start[:, 1])
-    return dataclasses.replace(batch, intervals=intervals, q0=q0, v0=v0)
+    made = jax.device_put((reference, reference[:, 0, 0], reference[:, 0, 1]))
+    return eqx.tree_at(lambda b: (b.intervals.reference, b.q0, b.v0), batch, made)

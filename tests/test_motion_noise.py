@@ -1,0 +1,109 @@
+"""Noise of recorded positions: its level, its way into a batch, and p-values that allow for it.
+
+Torque is that of inverse dynamics written out here, along motions in closed form.
+"""
+
+import numpy as np
+import pytest
+
+import jaxid
+from jaxid.control import Tracking
+from jaxid.discovery import motion_noise
+from jaxid.effects import Coulomb, JointElasticity, Stribeck, TimeDelay, Viscous
+from jaxid.signals.encoder import position_noise
+from jaxid.simulation.batch import prepare
+from jaxid.simulation.perturbed import with_errors
+
+MASS, DRAG, DRY = 5.0, 4.0, 3.0
+RATE, DEVIATION = 200.0, 2e-5
+
+
+def recorded(rng, deviation=DEVIATION, step=0.0, samples=2400):
+    """An axis whose encoder has white noise, or steps."""
+    time = np.arange(samples) / RATE
+    rates, phases = 2 * np.pi * np.array([0.2, 0.5, 1.3]), rng.uniform(0, 6, 3)
+    sizes = np.array([0.2, 0.08, 0.02])
+
+    def motion(order):
+        turned = time[:, None] * rates + phases + order * np.pi / 2
+        return (sizes * rates**order * np.sin(turned)).sum(axis=1)
+
+    q, v, a = map(motion, range(3))
+    tau = MASS * a + DRAG * v + DRY * 2 / np.pi * np.arctan(v / 0.01)
+    tau = tau + 0.1 * rng.standard_normal(samples)
+    q = q + deviation * rng.standard_normal(samples)
+    q = step * np.round(q / step) if step else q
+    return jaxid.Recording.from_arrays(time, q, tau, name=f"run_{rng.integers(10**9)}")
+
+
+def axis(cutoff=None):
+    effects = Viscous(1, 1.0), Coulomb(1, 1.0, smoothing=0.01)
+    return jaxid.ClosedLoop(jaxid.arms.Axis(M=MASS), Tracking(cutoff=cutoff), effects, name="axis")
+
+
+@pytest.mark.parametrize(("deviation", "step"), [(2e-5, 0.0), (2e-4, 0.0), (0.0, 1e-4)])
+def test_the_noise_of_an_encoder_is_measured_where_there_is_no_motion(deviation, step):
+    found = position_noise(recorded(np.random.default_rng(1), deviation, step))
+    # Steps of an encoder are uniform errors.
+    expected = deviation or step / np.sqrt(12)
+    np.testing.assert_allclose(found, expected, rtol=0.12)
+    short = recorded(np.random.default_rng(1), samples=40)
+    np.testing.assert_array_equal(position_noise(short), 0.0)
+
+
+def test_errors_enter_a_batch_like_those_of_a_recording():
+    rng, loop = np.random.default_rng(2), axis(cutoff=RATE / 4)
+    records = [recorded(rng, samples=n) for n in (900, 1200)]
+    errors = [1e-3 * rng.standard_normal(r.q.shape) for r in records]
+    other = [
+        jaxid.Recording.from_arrays(r.time, r.q + e, r.tau, name=r.name)
+        for r, e in zip(records, errors, strict=True)
+    ]
+    found, expected = (
+        with_errors(loop, records, prepare(loop, records), errors),
+        prepare(loop, other),
+    )
+    # The measured position is not compared.
+    for name in ("q0", "v0", "tau"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9)
+    reference = np.asarray(expected.intervals.reference)
+    np.testing.assert_allclose(
+        found.intervals.reference, reference, atol=1e-8 * abs(reference).max()
+    )
+
+
+CATALOGUE = (JointElasticity, TimeDelay, Stribeck)
+
+
+def least(seed, monkeypatch=None):
+    """The smallest p-value of a clean axis."""
+    rng = np.random.default_rng([3, seed])
+    runs = [recorded(rng), recorded(rng)]
+    fit = jaxid.fit(axis(cutoff=10.0), runs, jaxid.OEM(progress=False))
+    found = jaxid.diagnose(fit, catalogue=CATALOGUE, progress=False)
+    return min((*found.ranking, *found.where), key=lambda v: v.p_value)
+
+
+def test_p_values_of_clean_recordings_allow_for_the_noise_of_the_motion(monkeypatch):
+    p_values = [least(seed).p_value for seed in range(6)]
+    # Six uniform numbers are all above this with a probability of 0.99.
+    assert min(p_values) > 0.0017
+    with monkeypatch.context() as patch:
+        patch.setattr(motion_noise, "position_noise", lambda r: np.zeros(1))
+        without = least(0)
+    assert without.p_value < 1e-6
+    assert without.hypothesis.name in ("joint_elasticity", "time_delay")
+
+
+def test_an_elastic_joint_is_still_found():
+    rng = np.random.default_rng(4)
+    runs = [recorded(rng) for _ in range(2)]
+    late = [
+        jaxid.Recording.from_arrays(
+            r.time, r.q, r.tau + 0.02 * np.gradient(r.tau, 1 / RATE, axis=0), name=r.name
+        )
+        for r in runs
+    ]
+    fit = jaxid.fit(axis(cutoff=10.0).hold("delay"), late, jaxid.OEM(progress=False))
+    found = jaxid.diagnose(fit, catalogue=CATALOGUE, progress=False)
+    assert found.ranking[0].p_value < 1e-6
