@@ -1,10 +1,11 @@
-"""Distribution of p-values on clean recordings.
+"""Distribution of p-values and coverage of intervals on clean recordings.
 
 python -m benchmarks.p_values [--seed N] [--law known|unknown] [--quick] [--json FILE] [--jobs 2]
 
 A robot's motions are simulated once and its noise is drawn several times. If no effect is missing,
-the smallest corrected p-value of a diagnosis should be uniform between 0 and 1. If the law is
-unknown, torque is compared along the recorded motion.
+the smallest corrected p-value of a diagnosis should be uniform between 0 and 1, and nominal 95 %
+intervals should contain the true values in 95 % of pairs. If the law is unknown, torque is compared
+along the recorded motion.
 """
 
 import argparse
@@ -52,9 +53,8 @@ def draw_robots(master: int, law: str, quick: bool = False) -> list[Robot]:
     return [Robot(s, c, draws, law) for s, c in zip(seeds, colours, strict=True)]
 
 
-def pairs(robot: Robot) -> list[jaxid.Recordings]:
+def pairs(case: sim.Case, robot: Robot) -> list[jaxid.Recordings]:
     """Clean recordings of one robot that differ only in their noise."""
-    case = sim.make_case(robot.seed, (), robot.colour)
     rng = np.random.default_rng([robot.seed, 1])
     made = []
     for _ in range(robot.draws):
@@ -70,16 +70,19 @@ def pairs(robot: Robot) -> list[jaxid.Recordings]:
 
 
 def judge_robot(robot: Robot) -> list[dict[str, Any]]:
-    """The smallest p-value of each pair's diagnosis, with its hypothesis."""
+    """The smallest p-value of each pair's diagnosis with its hypothesis, and errors of values."""
     rows, loop = [], jaxid.scara()
+    case = sim.make_case(robot.seed, (), robot.colour)
+    truth = {**vars(case.plant), "delay": 0.0}
     if robot.law == "unknown":
         loop = jaxid.scara(jaxid.control.Tracking())
-    for number, recordings in enumerate(pairs(robot)):
+    for number, recordings in enumerate(pairs(case, robot)):
         started = time.perf_counter()
         start = "auto" if number == 0 else "given"
         fit = jaxid.fit(loop, recordings, jaxid.OEM(start=start, progress=False))
         # The same robot with other noise, so the next fit starts near its optimum.
         loop = fit.loop
+        off = (fit.theta - np.array([truth[name] for name in fit.names])) / fit.std
         diagnosis = jaxid.diagnose(fit, progress=False)
         least = min((*diagnosis.ranking, *diagnosis.where), key=lambda v: v.p_value)
         rows.append(
@@ -98,6 +101,7 @@ def judge_robot(robot: Robot) -> list[dict[str, Any]]:
                     if not isinstance(v.hypothesis.effect, jaxid.effects.AbstractTransmission)
                 ),
                 "adequate": diagnosis.adequate,
+                "off": dict(zip(fit.names, off.tolist(), strict=True)),
                 "seconds": time.perf_counter() - started,
             }
         )
@@ -107,6 +111,7 @@ def judge_robot(robot: Robot) -> list[dict[str, Any]]:
 def summary(table: pd.DataFrame) -> dict[str, Any]:
     """Fractions and quantiles, in total and by colour."""
     least = table["p"]
+    inside = pd.DataFrame.from_records(table["off"].to_list()).abs() <= 1.959964
     return {
         "pairs": len(table),
         "below_0.05_percent": 100 * float(np.mean(least < 0.05)),
@@ -121,6 +126,7 @@ def summary(table: pd.DataFrame) -> dict[str, Any]:
         "below_0.05_ranking_percent": 100 * float(np.mean(table["ranking_p"] < 0.05)),
         "below_0.05_curves_percent": 100 * float(np.mean(table["curves_p"] < 0.05)),
         "below_0.05_without_transmissions_percent": 100 * float(np.mean(table["others_p"] < 0.05)),
+        "covered_percent": (100 * inside.mean()).to_dict(),
         "worst": table.nsmallest(8, "p").to_dict(orient="records"),
     }
 
@@ -138,6 +144,8 @@ def show_summary(result: dict[str, Any]) -> None:
         f"curves alone {result['below_0.05_curves_percent']:.1f} %, all without transmissions "
         f"{result['below_0.05_without_transmissions_percent']:.1f} %"
     )
+    shown = ", ".join(f"{n} {x:.1f}" for n, x in result["covered_percent"].items())
+    print(f"95 % intervals that contain the truth, %: {shown}")
     for should, is_ in result["quantiles"].items():
         print(f"quantile {should:5s} {is_:.4f}")
     for row in result["worst"]:
