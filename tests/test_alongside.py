@@ -121,7 +121,7 @@ def delays(**case) -> tuple[float, ...]:
 def late(recordings: jaxid.Recordings, catalogue: Sequence[type]) -> tuple[float, ...]:
     fit = jaxid.fit(jaxid.scara(), recordings)
     screened = screen(fit, catalogue, silent)
-    return delays_of_drives(judge(fit, screened, 0.01), screened)
+    return delays_of_drives(judge(fit, screened, 0.01, lambda _: None), screened)
 
 
 @pytest.mark.parametrize(

@@ -107,17 +107,3 @@ def test_an_elastic_joint_is_still_found():
     fit = jaxid.fit(axis(cutoff=10.0).hold("delay"), late, jaxid.OEM(progress=False))
     found = jaxid.diagnose(fit, catalogue=CATALOGUE, progress=False)
     assert found.ranking[0].p_value < 1e-6
-
-
-def test_the_low_pass_on_the_motion_does_not_bias_an_inertia():
-    off = []
-    for seed in range(2):
-        rng = np.random.default_rng([5, seed])
-        runs = [recorded(rng), recorded(rng)]
-        fit = jaxid.fit(axis(), runs, jaxid.OEM(progress=False))
-        # The fastest tone is at half the cutoff.
-        assert 2.0 < fit.loop.controller.cutoff < 3.5
-        row = fit.table().loc["M"]
-        off.append((row["value"] - MASS) / row["std"])
-    # With equal cutoffs on motion and torque it was ten deviations.
-    assert np.abs(off).max() < 3.0

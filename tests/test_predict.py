@@ -26,7 +26,7 @@ def found():
     recordings, _ = recordings_of(case)
     fit = jaxid.fit(jaxid.scara(), recordings, jaxid.OEM(progress=False))
     screened = screen(fit, jaxid.catalogue, silent)
-    return fit, screened, judge(fit, screened, 0.01)
+    return fit, screened, judge(fit, screened, 0.01, lambda _: None)
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,6 @@ from ._base import AbstractController, Reading, Reference, Signals
 # Largest cutoff on the motion as a share of the sample rate. There the second derivative of a cubic
 # spline is 22 % too large.
 _KNOWN = 1 / 4
-# Ratio of the cutoffs on motion and torque. The low-pass on the motion has no counterpart on the
-# torque: with equal cutoffs it takes 1 % of the acceleration at half the cutoff. An inertia was
-# wrong by twelve of its deviations, and is by one and a half with this ratio.
-_BEYOND = 1.5
 
 
 class Tracking(AbstractController):
@@ -88,13 +84,11 @@ class Tracking(AbstractController):
         return float(self.cutoff or signal_cutoff(recording))
 
     def known(self, recording: Recording) -> float:
-        """Cutoff of the low-pass on a recorded motion, Hz, above that on the torque.
+        """Cutoff of the low-pass on a recorded motion, Hz: that on the torque, or higher.
 
         Near a reversal friction depends on higher frequencies of the velocity than are compared.
         """
-        beyond = _BEYOND * self.comparable(recording)
-        known = max(beyond, signal_cutoff(recording, highest=_KNOWN))
-        return min(known, max(_KNOWN * recording.rate, self.comparable(recording)))
+        return max(self.comparable(recording), signal_cutoff(recording, highest=_KNOWN))
 
     def settled(self, recordings: Iterable[Recording]) -> "Tracking":
         """The controller with one cutoff for all recordings."""
