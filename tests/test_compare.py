@@ -113,10 +113,10 @@ def test_tracking_compares_torques_that_passed_the_same_low_pass(loop, recording
     tracking = dataclasses.replace(loop, controller=Tracking(cutoff=5.0), standstill=every)
     found = jaxid.compare(tracking, recordings)
     time, measured, simulated = found.judged(0)
-    # Two periods of the cutoff are lost at each end.
-    assert time[0] == pytest.approx(0.4, abs=0.011)
+    # Three periods of the cutoff are lost at each end.
+    assert time[0] == pytest.approx(0.6, abs=0.011)
     assert np.diff(time) == pytest.approx(0.08)
-    assert recordings[0].time[-1] - 0.4 - 0.08 < time[-1] < recordings[0].time[-1] - 0.4 + 0.011
+    assert recordings[0].time[-1] - 0.6 - 0.08 < time[-1] < recordings[0].time[-1] - 0.6 + 0.011
     assert measured.shape == simulated.shape == (len(time), 2)
     rows = np.linalg.norm(measured - simulated, axis=0) / np.linalg.norm(measured, axis=0)
     assert np.allclose(100 * rows, found.error_percent.loc["fit_1"])

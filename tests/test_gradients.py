@@ -173,7 +173,7 @@ CASES = {
         lambda: one_joint(Sampled(PD(Kp=150.0, Kv=20.0, Kg=0.1), every=0.004), Coulomb(1, 0.1)),
         record(1),
     ),
-    "tracking": (lambda: one_joint(Tracking(cutoff=15.0), Coulomb(1, 0.1)), record(1)),
+    "tracking": (lambda: one_joint(Tracking(cutoff=15.0), Coulomb(1, 0.1)), record(1, 0.6)),
     "open loop": (lambda: one_joint(OpenLoop(), Coulomb(1, 0.1)), record(1)),
 }
 
