@@ -75,7 +75,7 @@ def test_errors_enter_a_batch_like_those_of_a_recording():
 CATALOGUE = (JointElasticity, TimeDelay, Stribeck)
 
 
-def least(seed, monkeypatch=None):
+def least(seed):
     """The smallest p-value of a clean axis."""
     rng = np.random.default_rng([3, seed])
     runs = [recorded(rng), recorded(rng)]

@@ -367,7 +367,6 @@ class Diagnosis(AbstractShown):
     def __repr__(self) -> str:
         table = self.table().head(12)
         state = "nothing significant is missing" if self.adequate else "something is missing"
-
         if isinstance(self.fit, Fit) and self.fit.mistake:
             # Effects would only approximate the mistake.
             state = f"{self.fit.mistake}; correct this first"

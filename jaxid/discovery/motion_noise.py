@@ -81,7 +81,7 @@ def changes(
     proposed, kept = [(h.effect, h.tests) for h in offered], set(map(id, offered))
     asked = [h for h, there in zip(hypotheses, wanted, strict=True) if there and id(h) in kept]
     rng = np.random.default_rng(0)
-    found: list[tuple[System, dict[int, tuple[int, ...]], np.ndarray]] = []
+    residual, base, tables = [], [], []
     for draw in range(1, _DRAWS + 1):
         say(f"noise of the recorded motion, draw {draw} of {_DRAWS}")
         errors = [
@@ -91,15 +91,21 @@ def changes(
         moved, table = signatures(
             system.loop, system.batch, system.linear, proposed, row, lambda _: None
         )
-        found.append((system, {id(h.effect): h.columns for h in moved}, table))
+        residual.append(system.residual)
+        base.append(system.base)
+        own = {id(h.effect): list(h.columns) for h in moved}
+        # Only these columns are kept: the table of an arm of six joints has thousands.
+        tables.append({id(h): table[..., own[id(h.effect)]] for h in asked if id(h.effect) in own})
     # A simulation that diverges with the added noise has no signature.
-    asked = [h for h in asked if all(id(h.effect) in own for _, own, _ in found)]
+    asked = [h for h in asked if all(id(h) in some for some in tables)]
+    if not asked:
+        return None
     columns = tuple(c for h in asked for c in h.columns)
-    tables = [table[..., [c for h in asked for c in own[id(h.effect)]]] for _, own, table in found]
+    moved_by = [np.concatenate([some[id(h)] for h in asked], axis=-1) for some in tables]
     return Changes(
-        np.stack([system.residual for system, _, _ in found]) - data.residual,
-        np.stack([system.base for system, _, _ in found]) - data.base,
-        np.stack(tables) - data.columns(columns),
+        np.stack(residual) - data.residual,
+        np.stack(base) - data.base,
+        np.stack(moved_by) - data.columns(columns),
         columns,
     )
 

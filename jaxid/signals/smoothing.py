@@ -80,10 +80,19 @@ def resampled(
 
 
 def smooth_motion(
-    recording: Recording, cutoff: float, order: int = ORDER
+    recording: Recording,
+    cutoff: float,
+    order: int = ORDER,
+    q: Float[np.ndarray, "samples joints"] | None = None,
 ) -> Float[np.ndarray, "samples joints"]:
-    """The recorded position, low-passed, at the recording's even times, rad or m."""
-    q = resampled(recording.time, recording.q, even_times(recording))
+    """The recorded position, low-passed, at the recording's even times, rad or m.
+
+    **Arguments:**
+
+    - `cutoff`: of the low-pass, Hz.
+    - `q`: other positions at the recording's times, rad or m.
+    """
+    q = resampled(recording.time, recording.q if q is None else q, even_times(recording))
     return low_pass(q, recording.rate, cutoff, order)
 
 

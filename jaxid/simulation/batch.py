@@ -144,9 +144,9 @@ def _drive(
     """The fields of the intervals of one recording, each padded to `length` points."""
     grid, ticks = points
     signals = loop.controller.signals(recording)
-    kind = torque_kind = "hold"
-    if not signals.hold:
-        kind, torque_kind = loop.stepping.interpolation, "linear"
+    kind, torque_kind = loop.stepping.interpolation, "linear"
+    if signals.hold:
+        kind = torque_kind = "hold"
     pad = length - len(grid)
 
     def padded(values: np.ndarray) -> np.ndarray:
