@@ -55,7 +55,13 @@ def set_loop_threshold() -> None:
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_THRESHOLD}".strip()
 
 
-def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+# Number of programs that a function keeps. A discovery calls most functions with a few structures.
+_KEPT = 8
+
+
+def compiled(
+    fun: Callable[_Arguments, _Result], *, kept: int = _KEPT
+) -> Callable[_Arguments, _Result]:
     """`jax.jit` for any arguments, with XLA options for the CPU that shorten compilation.
 
     Programs then compile in less time and run as fast (docs/process.md has numbers). An option
@@ -63,15 +69,16 @@ def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result
     program, or under a transformation such as `jax.grad`, is compiled with the options of the
     surrounding program, since JAX refuses options there.
 
-    Only the `_KEPT` programs that were used last are kept. `equinox.filter_jit` and `jax.jit` keep
-    all programs of a function: 400 MB for each robot of a long session.
+    Only the programs that were used last are kept. `equinox.filter_jit` and `jax.jit` keep all
+    programs of a function: 400 MB for each robot of a long session.
 
     **Arguments:**
 
     - `fun`: a pure function; arrays are traced, everything else is static. So are the arrays of
       fields that a class names in `constants`: what is known of them shortens the program.
+    - `kept`: number of programs that are kept.
     """
-    program = functools.lru_cache(_KEPT)(functools.partial(_Program, fun))
+    program = functools.lru_cache(kept)(functools.partial(_Program, fun))
     making = threading.Lock()
 
     @functools.wraps(fun)
@@ -87,10 +94,6 @@ def compiled(fun: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result
         return one(arrays)
 
     return call
-
-
-# Number of programs that each function keeps. A discovery calls a function with a few structures.
-_KEPT = 8
 
 
 class _Program:

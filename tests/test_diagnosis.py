@@ -50,7 +50,7 @@ def test_results_show_themselves(bump_story):
     assert {"effect", "joint", "p_value", "amplitude"} <= set(diagnosis.table().columns)
     assert diagnosis.where_table().iloc[0]["coordinate"] == "q2"
     # A story keeps the signatures of its rankings alone; those of all curves are far more.
-    assert diagnosis.data.table.shape[-1] < 0.5 * len(diagnosis.gram.score)
+    assert diagnosis.data.table.width < 0.5 * len(diagnosis.gram.score)
     with pytest.raises(jaxid.errors.FitError, match="diagnose"):
         diagnosis.predicted_error(diagnosis.where[0])
     for figure in (

@@ -9,7 +9,13 @@ import pytest
 import jaxid
 from jaxid.control import Tracking
 from jaxid.discovery import motion_noise
+from jaxid.discovery.data import Data
+from jaxid.discovery.motion_noise import Changes, _products
+from jaxid.discovery.score import Whitened
+from jaxid.discovery.table import SignatureTable
 from jaxid.effects import Coulomb, JointElasticity, Stribeck, TimeDelay, Viscous
+from jaxid.estimate.minimise import Prior
+from jaxid.noise import ARFilter
 from jaxid.signals.encoder import position_noise
 from jaxid.simulation.batch import prepare
 from jaxid.simulation.perturbed import with_errors
@@ -107,3 +113,36 @@ def test_an_elastic_joint_is_still_found():
     fit = jaxid.fit(axis(cutoff=10.0).hold("delay"), late, jaxid.OEM(progress=False))
     found = jaxid.diagnose(fit, catalogue=CATALOGUE, progress=False)
     assert found.ranking[0].p_value < 1e-6
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_products_of_changes_are_those_of_dense_matrices(known):
+    """The base absorbs a part of a signature, and it changes too."""
+    rng, shape = np.random.default_rng(5), (2, 60, 2)
+    base, table = rng.standard_normal((*shape, 3)), rng.standard_normal((*shape, 4))
+    table[:, :, 0, 1] = table[:, :, 1, 2] = 0.0
+    prior = Prior(np.eye(3)[:1], np.array([0.3, 0.0, 0.0])) if known else None
+    mask = np.ones(shape[:2], bool)
+    data = Data(rng.standard_normal(shape), base, SignatureTable.of(table), mask, known=prior)
+    noise = (ARFilter(np.array([-0.5]), 0.3), ARFilter(np.array([0.2]), 0.7))
+    white, columns, draws = Whitened.of(data, noise), [3, 1, 2], 2
+    moved = table[..., columns] + 0.1 * rng.standard_normal((draws, *shape, 3))
+    by_base = 0.1 * rng.standard_normal((draws, *shape, 3))
+    residual = rng.standard_normal((draws, *shape))
+    tables = tuple(SignatureTable.of(x) for x in moved)
+    changed = Changes(residual, by_base, tables, tuple(columns))
+    found = _products(changed, data, noise, white)
+
+    z, x = (data.white_columns(c, noise, k) for c, k in ((base, slice(None)), (table, None)))
+    taken = np.linalg.lstsq(z, x[:, columns])[0]
+    away = np.eye(len(z)) - z @ np.linalg.pinv(z)
+
+    def whole(rows):
+        flat = data.white(rows, noise).reshape(np.prod(shape), -1)
+        return np.pad(flat, ((0, len(z) - len(flat)), (0, 0)))
+
+    for one in range(draws):
+        change = away @ whole(moved[one] - table[..., columns] - by_base[one] @ taken)
+        for other in range(draws):
+            expected = change.T @ (away @ whole(residual[other]))[:, 0]
+            np.testing.assert_allclose(found[one, other], expected, rtol=1e-9, atol=1e-9)

@@ -59,7 +59,7 @@ def test_a_story_comes_back_to_the_bit(tmp_path: Path) -> None:
     assert back.to_dict() == story.to_dict()
     same(back.diagnosis.table(), story.diagnosis.table())
     # What explains which part of the residual is there without the signatures, in six digits.
-    assert back.diagnosis.data.table.size == back.diagnosis.data.base.size == 0
+    assert back.diagnosis.data.table.width == back.diagnosis.data.base.size == 0
     drawn, seen = (
         [np.asarray(trace.y, float) for trace in s.first_diagnosis.plot_shares(joint=2).data]
         for s in (back, story)

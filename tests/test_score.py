@@ -5,6 +5,7 @@ import pytest
 
 from jaxid.discovery.data import Data
 from jaxid.discovery.score import Gram, Whitened, corrected, effective_tests
+from jaxid.discovery.table import SignatureTable
 from jaxid.estimate.minimise import Prior
 from jaxid.noise import ARFilter
 
@@ -27,14 +28,14 @@ def drawn(known: bool) -> Data:
     residual, base = rng.standard_normal(shape), rng.standard_normal((*shape, 4))
     there = mask[..., None]
     base, table = base * there[..., None], table * there[..., None]
-    return Data(residual * there, base, table, mask, level, known=prior)
+    return Data(residual * there, base, SignatureTable.of(table), mask, level, known=prior)
 
 
 def dense(data: Data) -> tuple[np.ndarray, np.ndarray]:
     """Residual and scaled signatures as whole matrices, with the base projected out."""
     r = data.white_residual(data.residual, NOISE)
     z = data.white_columns(data.base, NOISE, slice(None))
-    x = data.white_columns(data.table.astype(float), NOISE)
+    x = data.white_columns(data.columns(range(COLUMNS)).astype(float), NOISE)
     size = np.linalg.norm(x, axis=0)
     x = x / np.where(size > 0, size, 1.0)
     basis = np.linalg.qr(z)[0]
@@ -82,7 +83,7 @@ def test_drawn_noise_has_the_covariance_of_the_products():
 
 def test_signatures_that_are_not_finite_are_no_gram_matrix():
     data = drawn(known=False)
-    data.table[0, 3, 1, 4] = np.inf
+    data.table.values[1][0, 3, 1] = np.inf
     with np.errstate(invalid="ignore"), pytest.raises(np.linalg.LinAlgError):
         Gram.of(data, NOISE)
 

@@ -23,6 +23,7 @@ from jaxid.discovery.loose import undetermined, with_fewer, without_loose
 from jaxid.discovery.models import Model, Visited, probability
 from jaxid.discovery.search import Search, _lost
 from jaxid.discovery.signs import of_one_sign
+from jaxid.discovery.table import SignatureTable
 from jaxid.discovery.verify import Refits
 from jaxid.effects import (
     AbstractEffect,
@@ -73,7 +74,7 @@ class OffsetAndThrust(OffsetAndDrag):
 
 def data_of(rest: np.ndarray) -> Data:
     none = np.zeros((*rest.shape, 0))
-    return Data(rest, none, none, np.ones(rest.shape[:2], bool))
+    return Data(rest, none, SignatureTable.of(none), np.ones(rest.shape[:2], bool))
 
 
 def test_score_of_white_noise_is_its_likelihood_and_the_price():

@@ -10,6 +10,7 @@ from scipy.stats import binom
 from jaxid.discovery.data import Data
 from jaxid.discovery.score import Gram, chance
 from jaxid.discovery.separate import estimate_noise
+from jaxid.discovery.table import SignatureTable
 
 SAMPLES, DRAWS = 300, 80
 TIME = np.linspace(0, 1, SAMPLES)
@@ -27,7 +28,7 @@ def drawn(rng: np.random.Generator, levels: tuple[float, ...]) -> Data:
     return Data(
         np.stack(noise)[..., None],
         np.stack([base] * len(levels))[:, :, None],
-        table.astype(np.float32),
+        SignatureTable.of(table.astype(np.float32)),
         np.ones((len(levels), SAMPLES), bool),
     )
 
@@ -65,9 +66,12 @@ def test_levels_are_those_of_the_noise():
 def at_rest(data: Data, share: float) -> Data:
     """The same data with that share of the rows not compared, in the middle of each recording."""
     rows = np.abs(TIME - 0.5) < share / 2
-    cut = {n: np.where(rows[:, None, None], 0.0, getattr(data, n)) for n in ("base", "table")}
-    cut["table"] = cut["table"].astype(np.float32)
-    return dataclasses.replace(data, residual=np.where(rows[:, None], 0.0, data.residual), **cut)
+    base, table = (
+        np.where(rows[:, None, None], x.dtype.type(0), x)
+        for x in (data.base, data.columns(range(4)))
+    )
+    residual = np.where(rows[:, None], 0.0, data.residual)
+    return dataclasses.replace(data, residual=residual, base=base, table=SignatureTable.of(table))
 
 
 def test_rows_at_rest_do_not_make_the_noise_weaker():
@@ -87,9 +91,10 @@ def test_recordings_of_equal_noise_have_one_level_however_long_they_rest():
     for _ in range(20):
         whole, resting = (drawn(rng, (1.0,)) for _ in range(2))
         resting = at_rest(resting, 0.6)
-        names = "residual", "base", "table", "mask"
+        names = "residual", "base", "mask"
         both = {n: np.concatenate([getattr(x, n) for x in (whole, resting)]) for n in names}
-        apart += estimate_noise(Data(**both), [(0,), (1,)]).data.level is not None
+        table = SignatureTable.of(np.concatenate([x.columns(range(4)) for x in (whole, resting)]))
+        apart += estimate_noise(Data(table=table, **both), [(0,), (1,)]).data.level is not None
     assert apart <= 2
 
 
@@ -108,7 +113,7 @@ def test_the_middle_of_recordings_stays_within_their_samples():
     assert part.residual.shape == (2, 100, 1)
     assert part.mask.all()
     np.testing.assert_array_equal(part.residual[0], data.residual[0, 100:200])
-    np.testing.assert_array_equal(part.table[1], data.table[1, 25:125])
+    np.testing.assert_array_equal(part.columns([3])[1], data.columns([3])[1, 25:125])
     assert data.middle(600, least=1) is data
     # Short pieces stay whole, however many they are.
     assert data.middle(200) is data
@@ -117,7 +122,7 @@ def test_the_middle_of_recordings_stays_within_their_samples():
 def test_the_middle_tells_the_same_noise_and_physics():
     blocks = [(0,), (1,), (2,), (3,)]
     data = drawn(np.random.default_rng(14), (1.0, 2.0))
-    seen = dataclasses.replace(data, residual=data.residual + 3.0 * data.table[..., 2])
+    seen = dataclasses.replace(data, residual=data.residual + 3.0 * data.columns([2])[..., 0])
     whole, part = estimate_noise(seen, blocks), estimate_noise(seen.middle(400, least=1), blocks)
     assert whole.chosen == part.chosen == [2]
     assert abs(part.noise[0].variance / whole.noise[0].variance - 1) < 0.3

@@ -12,6 +12,7 @@ import jaxid
 from jaxid.control import Tracking
 from jaxid.discovery.data import Data
 from jaxid.discovery.support import _errors, _stretches
+from jaxid.discovery.table import SignatureTable
 from jaxid.effects import EndStop, Spring, ThermalDrift
 from jaxid.estimate.minimise import Prior
 
@@ -38,7 +39,8 @@ def test_each_recording_is_cut_by_its_own_length():
     mask = np.arange(600) < np.array([600, 90])[:, None]
     shape = (2, 600, 2)
     known = Prior(np.eye(1, 3), np.zeros(3))
-    data = Data(np.ones(shape), np.ones((*shape, 3)), np.ones((*shape, 0)), mask, known=known)
+    table = SignatureTable.of(np.ones((*shape, 0)))
+    data = Data(np.ones(shape), np.ones((*shape, 3)), table, mask, known=known)
     *rows, last = _stretches(data)
     assert last == -1
     number = np.reshape(rows, shape)[..., 0]

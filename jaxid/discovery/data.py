@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -10,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from ..errors import FitError
 from ..estimate.minimise import Prior
 from ..noise import ARFilter
+from .table import SignatureTable, stretches
 
 Rows = Float[np.ndarray, "recordings samples outputs"]
 
@@ -41,11 +43,16 @@ class Data(eqx.Module):
 
     residual: Rows
     base: Float[np.ndarray, "recordings samples outputs absorbed"]
-    table: Float[np.ndarray, "recordings samples outputs columns"]
+    table: SignatureTable
     mask: Bool[np.ndarray, "recordings samples"]
     level: Float[np.ndarray, "recordings outputs"] | None = None
     kept: tuple[int, ...] | None = eqx.field(static=True, default=None)
     known: Prior | None = None
+
+    @classmethod
+    def fields_of_format(cls, fields: dict[str, Any], written: int) -> dict[str, Any]:
+        """Converts fields of an older file format, which stored signatures as one array."""
+        return fields if written > 3 else {**fields, "table": SignatureTable.of(fields["table"])}
 
     @property
     def there(self) -> Bool[np.ndarray, "recordings samples outputs"]:
@@ -64,11 +71,12 @@ class Data(eqx.Module):
 
         **Raises:** `FitError` if they have not been kept.
         """
-        return self.table[..., places_among(numbers, self.kept)]
+        return self.table.dense(places_among(numbers, self.kept))
 
     def only(self, numbers: Sequence[int]) -> "Data":
         """The same with only these columns of the table."""
-        return dataclasses.replace(self, table=self.columns(numbers), kept=tuple(numbers))
+        table = self.table.only(places_among(numbers, self.kept))
+        return dataclasses.replace(self, table=table, kept=tuple(numbers))
 
     def series(self, rows: Rows, output: int) -> list[np.ndarray]:
         """One output's rows, one series per recording, scaled to a common noise level."""
@@ -125,13 +133,22 @@ class Data(eqx.Module):
         self, output: int, noise: ARFilter
     ) -> tuple[Float[np.ndarray, "rows some"], Int[np.ndarray, " some"]]:
         """The whitened signatures of one output, and the numbers of those that are not zero."""
-        own = self.table[:, :, output]
-        columns = np.flatnonzero(own.any(axis=(0, 1)))
+        own, columns = self.table.values[output], self.table.columns[output]
         there = self.there[..., output, None]
-        white = whitened(own.take(columns, axis=2)[:, :, None], [noise], there)
+        white = whitened(own[:, :, None], [noise], there)
         if self.level is not None:
             white /= self.level[:, output, None, None, None].astype(white.dtype)
-        return white.reshape(-1, len(columns)), columns
+        return white.reshape(own.shape[0] * own.shape[1], len(columns)), columns
+
+    def white_products(
+        self, noise: Sequence[ARFilter], x: Float[np.ndarray, "recordings samples outputs some"]
+    ) -> Float[np.ndarray, "columns some"]:
+        """Products of the whitened signatures with other columns, in double precision."""
+        found = np.zeros((self.table.width, x.shape[-1]))
+        for output, filt in enumerate(noise):
+            white, columns = self.white_signatures(output, filt)
+            found[columns] += white.T.astype(float) @ x[:, :, output].reshape(len(white), -1)
+        return found
 
     def known_left(
         self, taken: Float[np.ndarray, " absorbed"] | None = None
@@ -159,15 +176,12 @@ class Data(eqx.Module):
         spare = np.maximum(self.mask.sum(axis=1) - length, 0)
         first = np.minimum(np.argmax(self.mask, axis=1) + spare // 2, samples - length)
 
-        def cut(rows: np.ndarray) -> np.ndarray:
-            return np.stack([r[at : at + length] for r, at in zip(rows, first, strict=True)])
-
         return dataclasses.replace(
             self,
-            residual=cut(self.residual),
-            base=cut(self.base),
-            table=cut(self.table),
-            mask=cut(self.mask),
+            residual=stretches(self.residual, first, length),
+            base=stretches(self.base, first, length),
+            table=self.table.rows(first, length),
+            mask=stretches(self.mask, first, length),
         )
 
 

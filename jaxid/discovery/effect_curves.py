@@ -21,8 +21,8 @@ from ..estimate import Fit
 from ..recording import Recording, Recordings
 from ..simulation.loop import ClosedLoop
 from .comparison import Comparison, compare
+from .forces import force_and_slopes, left_for_links, misreads
 from .hypotheses import effect_on
-from .signatures import force_and_slopes, left_for_links, misreads
 from .text import WIDTH
 
 if TYPE_CHECKING:

@@ -202,7 +202,7 @@ def _separations(
     batch = prepare(loop, drawn)
     linear = linearise(loop, batch, "tau")
     proposed = [(v.hypothesis.effect, 1.0) for v in chosen]
-    hypotheses, rows = signatures(loop, batch, linear, proposed, 0, lambda text: None)
+    hypotheses, table = signatures(loop, batch, linear, proposed, 0, lambda text: None)
     base = at_samples(batch, np.asarray(base_columns(linear, loop.theta.shape[0], False)))
     seen = sampled(batch, np.asarray(linear.seen))
     kept = np.asarray(batch.kept)
@@ -218,7 +218,7 @@ def _separations(
             # Only the signatures matter, but a row without a residual counts as not compared.
             residual=np.ones((1, *base.shape[1:3])) * kept[k : k + 1, :, None],
             base=base[k : k + 1],
-            table=rows[k : k + 1],
+            table=table.recordings(slice(k, k + 1)),
             mask=kept[k : k + 1],
         )
         scores[k] = _apart(Gram.of(data, diagnosis.noise), columns, sizes)

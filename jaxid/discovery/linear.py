@@ -7,12 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..compiling import compiled
 from ..effects import AbstractTransmission, Motion
 from ..simulation.batch import Batch, Interval
-from ..simulation.compared import compared_table
+from ..simulation.compared import compared_series, compared_table
 from ..simulation.dynamics import imposed
 from ..simulation.integration import SIGNALS, initial, start_slopes
 from ..simulation.loads import link_load
@@ -258,6 +258,15 @@ def at_samples(
         batch.band, batch.moving, batch.mask, table.reshape(*table.shape[:3], -1)
     )
     return found.reshape(*found.shape[:3], *columns)
+
+
+def series_at_samples(
+    batch: Batch,
+    output: Int[np.ndarray, " series"],
+    x: Float[np.ndarray, "recordings points series"],
+) -> Float[np.ndarray, "recordings rows series"]:
+    """The same for series that each belong to one output."""
+    return compared_series(batch.band, batch.moving, batch.mask, output, sampled(batch, x))
 
 
 def row_period(

@@ -15,6 +15,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..effects.placed import alike
 from ..estimate import Fit
 from ..estimate.oem import oem_of
 from ..estimate.pieces import pieces_of
@@ -27,6 +28,7 @@ from .hypotheses import Hypothesis
 from .score import WEAK, Gram, Whitened
 from .signatures import signatures
 from .system import System
+from .table import SignatureTable
 
 # Largest p-value of a hypothesis whose score is corrected.
 _POSSIBLE = 0.5
@@ -41,13 +43,14 @@ _LEVEL = 0.1
 class Changes(eqx.Module):
     """Changes by noise that is added to the recorded motion, for each draw.
 
-    - `residual`, `base`, `table`: as in `Data`; the table has the columns of some hypotheses.
-    - `columns`: their numbers in the table of all hypotheses.
+    - `residual`, `base`: changes of those in `Data`.
+    - `tables`: signatures of some hypotheses, with the noise.
+    - `columns`: numbers of their columns in the table of all hypotheses.
     """
 
     residual: Float[np.ndarray, "draws recordings samples outputs"]
     base: Float[np.ndarray, "draws recordings samples outputs absorbed"]
-    table: Float[np.ndarray, "draws recordings samples outputs some"]
+    tables: tuple[SignatureTable, ...]
     columns: tuple[int, ...] = eqx.field(static=True)
 
 
@@ -74,8 +77,7 @@ def changes(
     levels = [position_noise(r) for r in pieces]
     if not any(np.any(level > 0) for level in levels):
         return None
-    # All signatures by response share one program.
-    offered = [h for h in hypotheses if not h.effect.finite]
+    offered = _together(hypotheses, wanted, fit.loop.joints)
     if any(h.effect.finite for h, there in zip(hypotheses, wanted, strict=True) if there):
         offered += _leading(hypotheses, p_values)
     proposed, kept = [(h.effect, h.tests) for h in offered], set(map(id, offered))
@@ -94,20 +96,30 @@ def changes(
         residual.append(system.residual)
         base.append(system.base)
         own = {id(h.effect): list(h.columns) for h in moved}
-        # Only these columns are kept: the table of an arm of six joints has thousands.
-        tables.append({id(h): table[..., own[id(h.effect)]] for h in asked if id(h.effect) in own})
+        tables.append((own, table))
     # A simulation that diverges with the added noise has no signature.
-    asked = [h for h in asked if all(id(h) in some for some in tables)]
+    asked = [h for h in asked if all(id(h.effect) in own for own, _ in tables)]
     if not asked:
         return None
-    columns = tuple(c for h in asked for c in h.columns)
-    moved_by = [np.concatenate([some[id(h)] for h in asked], axis=-1) for some in tables]
     return Changes(
         np.stack(residual) - data.residual,
         np.stack(base) - data.base,
-        np.stack(moved_by) - data.columns(columns),
-        columns,
+        tuple(table.only([c for h in asked for c in own[id(h.effect)]]) for own, table in tables),
+        tuple(c for h in asked for c in h.columns),
     )
+
+
+def _together(
+    hypotheses: Sequence[Hypothesis], wanted: Sequence[bool], joints: int
+) -> list[Hypothesis]:
+    """Hypotheses by response whose structure has a wanted one; they share a compiled program."""
+    direct = [k for k, h in enumerate(hypotheses) if not h.effect.finite]
+    found = []
+    for _, places in alike([hypotheses[k].effect for k in direct], joints):
+        group = [direct[place] for place in places]
+        if any(wanted[k] for k in group):
+            found += group
+    return [hypotheses[k] for k in sorted(found)]
 
 
 def _leading(hypotheses: Sequence[Hypothesis], p_values: Sequence[float]) -> list[Hypothesis]:
@@ -187,18 +199,26 @@ def _products(
     changed: Changes, data: Data, noise: Sequence[ARFilter], white: Whitened
 ) -> Float[np.ndarray, "draws draws some"]:
     """Products of the changes of signatures in one draw with those of the residual in another."""
+    known = len(white.residual) - data.residual.size
+    # What the base absorbs of a signature changes as well.
     base = data.white_columns(data.base, noise, slice(None))
     size = np.linalg.norm(base, axis=0)
     size[size == 0] = 1.0
-    table = data.white_columns(data.columns(changed.columns).astype(float), noise)
-    # What the base absorbs of a signature changes as well.
-    taken = np.linalg.lstsq(base / size, table, rcond=1e-9)[0] / size[:, None]
+    absorbed = np.linalg.lstsq(base / size, white.basis, rcond=1e-9)[0] / size[:, None]
+    columns = list(changed.columns)
+    taken = absorbed @ (white.across[:, columns] * white.size[columns])
+    nominal = dataclasses.replace(data.only(columns), kept=None)
+    tables = [dataclasses.replace(nominal, table=table) for table in changed.tables]
 
     def projected(x: np.ndarray) -> np.ndarray:
-        rows = data.white(x, noise).reshape(-1, x.shape[-1])
-        rows = np.pad(rows, ((0, len(base) - len(rows)), (0, 0)))
-        return rows - white.basis @ (white.basis.T @ rows)
+        rows = np.pad(data.white(x, noise).ravel(), (0, known))
+        return (rows - white.basis @ (white.basis.T @ rows))[: x.size].reshape(x.shape)
 
-    left = [projected(t - b @ taken) for t, b in zip(changed.table, changed.base, strict=True)]
-    right = [projected(r[..., None])[:, 0] for r in changed.residual]
-    return np.array([[one.T @ other for other in right] for one in left])
+    found = []
+    right = np.stack([projected(r) for r in changed.residual], axis=-1)
+    flat = right.reshape(-1, len(tables))
+    first = nominal.white_products(noise, right)
+    for moved, change in zip(tables, changed.base, strict=True):
+        of_base = data.white(change, noise).reshape(len(flat), -1).T @ flat
+        found.append(moved.white_products(noise, right) - first - taken.T @ of_base)
+    return np.stack(found).transpose(0, 2, 1)

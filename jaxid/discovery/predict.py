@@ -22,11 +22,12 @@ from ..parameters import Bounds, read_values, write_values
 from .bounded import least_squares
 from .data import Data
 from .finite import differences
+from .forces import force_and_slopes, torques_of
 from .hypotheses import free_of
 from .linear import Place, at_samples, respond
 from .score import spanned
-from .signatures import force_and_slopes, torques_of
 from .system import System
+from .table import SignatureTable
 
 # Columns of one response. Missing columns are filled with zeros, so that few programs are compiled.
 _WIDTH = 8
@@ -82,7 +83,7 @@ class Predictor(eqx.Module):
         - `noise`: noise filters, one per output.
         - `level`: noise level of each recording, as in `Data`.
         """
-        none = np.zeros((*system.residual.shape, 0))
+        none = SignatureTable.of(np.zeros((*system.residual.shape, 0)))
         data = Data(system.residual, system.base, none, system.mask, level, known=system.known)
         base = data.white_columns(system.base, noise, slice(None))
         loop = system.loop

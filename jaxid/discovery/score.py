@@ -63,16 +63,16 @@ class Whitened(eqx.Module):
         basis = spanned(data.white_columns(data.base, noise, slice(None)))
         r = r - basis @ (basis.T @ r)
         outputs = [Part(*data.white_signatures(j, filt)) for j, filt in enumerate(noise)]
-        nothing = np.zeros((len(data.known_left()), 0), data.table.dtype)
+        nothing = np.zeros((len(data.known_left()), 0), outputs[0].values.dtype)
         parts = (*outputs, Part(nothing, np.zeros(0, int)))
-        power = np.zeros(data.table.shape[-1])
+        power = np.zeros(data.table.width)
         for part in parts:
             power[part.columns] += np.einsum("rc,rc->c", part.values, part.values)
         size = np.sqrt(np.where(power > 0, power, 1.0))
         for part in parts:
             part.values[...] /= size[part.columns].astype(part.values.dtype)
         count = data.compared.sum() + len(data.known_left()) - basis.shape[1]
-        across = _products(parts, basis.astype(data.table.dtype), len(size))
+        across = _products(parts, basis.astype(nothing.dtype), len(size))
         return cls(r, parts, basis, across, size, float(count))
 
     def columns(self, numbers: Sequence[int]) -> Float[np.ndarray, "rows some"]:

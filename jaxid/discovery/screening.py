@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from ..display.progress import working
 from ..effects import AbstractEffect, AbstractTransmission, Scene
@@ -25,6 +24,7 @@ from .linear import at_rows, row_period
 from .ranking import Screened, judge
 from .signatures import signatures
 from .system import System
+from .table import SignatureTable
 
 
 @with_one_blas_thread
@@ -157,10 +157,10 @@ def _can_be_told(loop: ClosedLoop, effect: AbstractEffect) -> bool:
 def _check_finite(
     loop: ClosedLoop,
     hypotheses: Sequence[Hypothesis],
-    table: Float[np.ndarray, "recordings rows outputs columns"],
+    table: SignatureTable,
 ) -> None:
     """Raises `FitError` if a signature is not finite."""
-    there = np.asarray(np.isfinite(table).all(axis=(0, 1, 2)))
+    there = table.finite
     bad = [h for h in hypotheses if not there[list(h.columns)].all()]
     if len(bad) > len(hypotheses) / 2:
         raise FitError(

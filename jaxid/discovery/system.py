@@ -21,8 +21,8 @@ from ..simulation.loop import ClosedLoop
 from ..simulation.perturbed import with_errors
 from ..simulation.steps import with_substeps
 from .comparison import Comparison
+from .forces import left_for_links
 from .linear import Linearised, at_samples, base_columns, linearise, sampled
-from .signatures import left_for_links
 
 
 class System(eqx.Module):

@@ -50,20 +50,43 @@ def compared_table(
     """
     if band is None and moving is None:
         return np.where(np.asarray(mask)[..., None, None], x, x.dtype.type(0))
-    joints = x.shape[2] if moving is None else moving.shape[2]
     series = x.reshape(*x.shape[:2], x.shape[2] * x.shape[3])
     # Most effects act on one joint, so most series are zero.
     filled = np.flatnonzero(series.any(axis=(0, 1)))
-    rows = np.shape(mask if band is None else band.keep)
-    found = np.zeros((*rows, series.shape[2]), x.dtype)
-    width = next((w for w in _WIDTHS if len(filled) <= w), _WIDTHS[-1])
-    for first in range(0, len(filled), width):
-        own = filled[first : first + width]
-        some = np.pad(series[..., own], [(0, 0)] * 2 + [(0, width - len(own))])
-        joint = np.resize(own // x.shape[3] % joints, width)
-        passed = _series(band, moving, mask, jnp.asarray(joint), jnp.asarray(some))
-        found[..., own] = np.asarray(passed)[..., : len(own)]
-    return found.reshape(*rows, *x.shape[2:])
+    found = np.zeros((*np.shape(mask if band is None else band.keep), series.shape[2]), x.dtype)
+    output = filled // x.shape[3]
+    found[..., filled] = compared_series(band, moving, mask, output, series[..., filled])
+    return found.reshape(*found.shape[:2], *x.shape[2:])
+
+
+def compared_series(
+    band: Band | None,
+    moving: Moving,
+    mask: Bool[Any, "recordings samples"],
+    output: Int[np.ndarray, " series"],
+    x: Float[np.ndarray, "recordings samples series"],
+) -> Float[np.ndarray, "recordings rows series"]:
+    """The compared part of many series, in their precision; zero for padding.
+
+    **Arguments:**
+
+    - `mask`: false for padding. `output`: index of the output that each series belongs to.
+    """
+    if band is None and moving is None:
+        return np.where(np.asarray(mask)[..., None], x, x.dtype.type(0))
+    # The outputs may be several signals of each joint.
+    joint = output if moving is None else output % moving.shape[2]
+    found = np.zeros((*np.shape(mask if band is None else band.keep), len(output)), x.dtype)
+    width = next((w for w in _WIDTHS if len(output) <= w), _WIDTHS[-1])
+    for first in range(0, len(output), width):
+        own = slice(first, first + width)
+        some = x[..., own]
+        spare = width - some.shape[-1]
+        some = np.pad(some, [(0, 0)] * 2 + [(0, spare)])
+        joints = jnp.asarray(np.pad(joint[own], (0, spare)))
+        passed = _series(band, moving, mask, joints, jnp.asarray(some))
+        found[..., own] = np.asarray(passed)[..., : width - spare]
+    return found
 
 
 @compiled

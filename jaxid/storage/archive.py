@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 # their names, its `fields_of_format(fields, format)` converts the fields.
 # 2: a loop stores held and freed parameters by place instead of by name.
 # 3: the smoothing of a sign is a speed instead of its inverse.
-FORMAT = 3
+# 4: signatures are stored by output.
+FORMAT = 4
 
 # Limit of the manifest, which contains all but arrays; a long story has about one megabyte.
 _LARGEST_MANIFEST = 256 * 2**20
