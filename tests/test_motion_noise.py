@@ -3,6 +3,8 @@
 Torque is that of inverse dynamics written out here, along motions in closed form.
 """
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from jaxid.discovery.motion_noise import Changes, _products
 from jaxid.discovery.score import Whitened
 from jaxid.discovery.table import SignatureTable
 from jaxid.effects import Coulomb, JointElasticity, Stribeck, TimeDelay, Viscous
+from jaxid.estimate.covariance import covariance_of
 from jaxid.estimate.minimise import Prior
 from jaxid.noise import ARFilter
 from jaxid.signals.encoder import position_noise
@@ -113,6 +116,26 @@ def test_an_elastic_joint_is_still_found():
     fit = jaxid.fit(axis(cutoff=10.0).hold("delay"), late, jaxid.OEM(progress=False))
     found = jaxid.diagnose(fit, catalogue=CATALOGUE, progress=False)
     assert found.ranking[0].p_value < 1e-6
+
+
+@pytest.mark.parametrize("kind", ["sandwich", "newey_west"])
+def test_deviations_contain_the_error_that_the_noise_of_the_motion_causes(kind):
+    """It makes the mass too small, by several deviations of the torque's noise."""
+    off, predicted, covered = [], [], []
+    for seed in range(8):
+        rng = np.random.default_rng([6, seed])
+        runs = [recorded(rng, 2e-4) for _ in range(2)]
+        fit = jaxid.fit(axis(cutoff=10.0), runs, jaxid.OEM(deviations=kind, progress=False))
+        plain = dataclasses.replace(fit.optimum, by_motion=None)
+        k = fit.names.index("M")
+        without = covariance_of(plain, kind)[0][k, k]
+        off.append(fit.theta[k] - MASS)
+        predicted.append(-np.sqrt(fit.covariance[k, k] - without))
+        covered.append(abs(off[-1]) < 2 * fit.std[k])
+        assert jaxid.with_deviations(fit, kind).std == pytest.approx(fit.std)
+    assert np.mean(off) == pytest.approx(np.mean(predicted), rel=0.25)
+    assert np.mean(off) < -2 * np.sqrt(without)
+    assert sum(covered) >= 7
 
 
 @pytest.mark.parametrize("known", [False, True])

@@ -36,11 +36,13 @@ class Optimum(eqx.Module):
 
     - `problem`: the minimised problem; `theta`: its parameters, those of a noise filter last;
       `start`: initial states.
+    - `by_motion`: mean of J'r that the noise of the recorded motion causes; None if there is none.
     """
 
     problem: Problem
     theta: Float[Any, " values"]
     start: Float[Any, "recordings initials"]
+    by_motion: Float[np.ndarray, " values"] | None = None
 
 
 class Reduced(eqx.Module):
@@ -131,6 +133,9 @@ def covariance_of(
         meat = known + score_covariance(reduced.residuals, jacobians, own + known)
     elif kind == "newey_west":
         meat = known + newey_west(reduced.residuals, jacobians)
+    if meat is not None and optimum.by_motion is not None:
+        mean = optimum.by_motion[: len(names)]
+        meat = meat + np.outer(mean, mean)
     covariance, lost = determined_covariance(own + known, names, scales, meat)
     if problem.prior is not None and np.isfinite(own).all():
         # A prior makes all deviations finite. Named is what the recordings alone do not determine.

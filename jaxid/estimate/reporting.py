@@ -1,5 +1,7 @@
 """The `Fit` of a minimisation."""
 
+import dataclasses
+
 import numpy as np
 
 from ..noise import Noise, VectorAR
@@ -10,6 +12,7 @@ from ..simulation.loop import ClosedLoop
 from .converge import Converged
 from .covariance import SAID, Deviations, covariance_of
 from .minimise import with_derivatives
+from .motion_noise import slope_by_motion_noise
 from .pieces import rejoined
 from .result import AbstractMethod, Fit, relative_errors, unphysical
 
@@ -33,9 +36,12 @@ def report(
     found, mask = done.minimum.point.found, np.asarray(done.batch.kept)
     p = len(done.loop.names)
     covariance, lost, said = np.full((p, p), np.inf), (), ""
+    optimum = done.optimum
     if done.minimum.status.simulated:
         whole = with_derivatives(done.problem, done.minimum.point)
-        covariance, lost = covariance_of(done.optimum, kind, noise, whole)
+        by_motion = slope_by_motion_noise(done.problem, done.minimum.point, done.pieces)
+        optimum = dataclasses.replace(optimum, by_motion=by_motion)
+        covariance, lost = covariance_of(optimum, kind, noise, whole)
         said = SAID[kind]
     raw, weights = np.asarray(found.raw), np.asarray(done.weights)
     unweighted = [raw[k][mask[k]] / weights for k in range(len(done.pieces))]
@@ -62,7 +68,7 @@ def report(
         notes=notes,
         noise=noise if noise is None or isinstance(noise, VectorAR) else tuple(noise),
         rounds=rounds,
-        optimum=done.optimum,
+        optimum=optimum,
     )
 
 
