@@ -20,7 +20,7 @@ from ..simulation.loop import ClosedLoop
 from ..simulation.sharing import with_one_blas_thread
 from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
-from .alongside import along_recorded, in_the_loop
+from .alongside import along_recorded, in_the_loop, one_late_drive, without_law
 from .asked import Asked, check_apart
 from .comparison import Comparison, compare
 from .diagnosis import over_recordings
@@ -121,9 +121,7 @@ def discover(
             resume, {"loop": loop, "search": asked.plan()}, classes_of(loop) | asked.classes()
         ) as campaign,
     ):
-        story = _with_and_without_standstill(
-            asked, campaign, say, along_recorded(loop), progress, started
-        )
+        story = _with_and_without_law(asked, campaign, say, along_recorded(loop), progress, started)
         simulated = imposed(loop) or not imposed(story.fit.loop)
         if simulated or story.interrupted or story.fit.mistake:
             return story
@@ -132,6 +130,39 @@ def discover(
         note = in_the_loop(loop, models, held_out or recordings)
         seconds = time.perf_counter() - started
         return dataclasses.replace(story, notes=(*story.notes, note), seconds=seconds)
+
+
+def _with_and_without_law(
+    asked: Asked,
+    campaign: Campaign,
+    say: Callable[[str], None],
+    loop: ClosedLoop,
+    progress: bool,
+    started: float,
+) -> Discovery:
+    """The result of a search, or of one without the law if effects of it approximate the law.
+
+    With one joint a late drive and a sampled law are the same. The law is not the declared one if
+    several effects beside the late drive are not needed along the recorded motion.
+    """
+    story = _with_and_without_standstill(asked, campaign, say, loop, progress, started)
+    along = without_law(loop)
+    if story.verdict != "explained" or along is loop or imposed(story.fit.loop):
+        return story
+    effects = [step.added for step in story.steps if step.added is not None]
+    why, most = one_late_drive(loop, effects, asked.recordings.common_period())
+    if not why:
+        return story
+    say("the same without the law")
+    again = Search(asked, campaign, say, live_figure(progress), prefix="without the law, ")
+    try:
+        other = _searched(again, along, started)
+    except KeyboardInterrupt:
+        return dataclasses.replace(story, interrupted=True, reason=_STOPPED)
+    if other.verdict not in ("adequate", "explained") or len(other.steps) - 1 > most:
+        return story
+    note = f"{why} sets of effects are compared along the recorded motion, without the law"
+    return dataclasses.replace(other, notes=(note, *other.notes))
 
 
 def _with_and_without_standstill(

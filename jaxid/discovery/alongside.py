@@ -27,6 +27,9 @@ from .separate import columns_of, select
 LATE = 2.0
 # Smallest significant delay, in standard deviations, and largest ratio of delays with one cause.
 _SURE, _ALIKE = 3.0, 2.0
+# Number of effects beside a late drive that must not be needed without the law. One may be missed
+# there, because a part of it is above the cutoff.
+_FEWER = 2
 # Effects that are the same as the delay of a drive, or approximate it.
 _LAGS = (TimeDelay, ActuatorLag, AbstractTransmission)
 # Steps between two grid points up to which a simulation is fast enough.
@@ -82,16 +85,40 @@ def late_drives(given: ClosedLoop, effects: Sequence[AbstractEffect], period: fl
     - `given`: the starting model. `effects`: those that the search has added. `period`: of the
       samples, s.
     """
+    return _as_sampled(_late(given, effects, period)) if given.joints > 1 else ""
+
+
+def one_late_drive(
+    given: ClosedLoop, effects: Sequence[AbstractEffect], period: float
+) -> tuple[str, int]:
+    """Why a search on one joint is repeated without the law; empty if it need not be.
+
+    A single drive that is late may be an effect, or the law is sampled. A sampled law that is
+    simulated as continuous has further errors, which several effects then approximate. Without the
+    law they are not needed.
+
+    **Arguments:** those of `late_drives`.
+
+    **Returns:** the reason, and the largest number of effects without the law that confirms it.
+    """
+    others = [e for e in effects if not isinstance(e, TimeDelay | ActuatorLag)]
+    most = len(others) - _FEWER
+    if given.joints > 1 or most < 0:
+        return "", 0
+    return _as_sampled(_late(given, effects, period)), most
+
+
+def _late(given: ClosedLoop, effects: Sequence[AbstractEffect], period: float) -> tuple[float, ...]:
+    """Delays of the drives, s, by added effects, if all drives are late by about the same time."""
     late: dict[int, float] = {}
     for effect in effects:
         if isinstance(effect, TimeDelay | ActuatorLag):
             delay = effect.delay if isinstance(effect, TimeDelay) else effect.time_constant
             late[effect.joint] = late.get(effect.joint, 0.0) + float(delay)
     times = tuple(late.values())
-    if not _may_be_sampled(given) or len(times) < given.joints:
-        return ""
-    alike = max(times) < _ALIKE * min(times) and max(times) < LATE * period
-    return _as_sampled(times) if alike else ""
+    if not _simulated_continuously(given) or len(times) < given.joints:
+        return ()
+    return times if max(times) < min(_ALIKE * min(times), LATE * period) else ()
 
 
 def _as_sampled(late: Sequence[float]) -> str:
@@ -126,7 +153,7 @@ def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, .
     **Arguments:** those of `sampled`.
     """
     loop, period = screened.system.loop, diagnosis.fit.recordings.common_period()
-    if not _may_be_sampled(loop):
+    if not _simulated_continuously(loop) or loop.joints == 1:
         return ()
     data = dataclasses.replace(screened.data, level=diagnosis.data.level)
     predictor = Predictor.of(screened.system, diagnosis.noise, data.level)
@@ -150,11 +177,10 @@ def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, .
     return tuple(found.tolist()) if sure else ()
 
 
-def _may_be_sampled(loop: ClosedLoop) -> bool:
-    """Whether delays of all drives would show that a law declared as continuous is sampled."""
+def _simulated_continuously(loop: ClosedLoop) -> bool:
+    """Whether a law that is declared as continuous is simulated, and torque is compared."""
     law = loop.controller
-    simulated = law.period is None and not law.imposes and law.judged == "torque"
-    return simulated and loop.joints > 1
+    return law.period is None and not law.imposes and law.judged == "torque"
 
 
 def _beside(
