@@ -15,11 +15,17 @@ from stories import recordings_of, silent
 import jaxid
 from jaxid import Stepping
 from jaxid.control import PD, OpenLoop, Sampled, Tracking
-from jaxid.discovery import alongside, started
-from jaxid.discovery.alongside import along_recorded, delays_of_drives, in_the_loop, late_drives
+from jaxid.discovery import _discover, alongside, started
+from jaxid.discovery.alongside import (
+    along_recorded,
+    delays_of_drives,
+    in_the_loop,
+    late_drives,
+    one_late_drive,
+)
 from jaxid.discovery.ranking import judge
 from jaxid.discovery.screening import screen
-from jaxid.effects import JointElasticity, Stribeck, TimeDelay, TorqueOffset
+from jaxid.effects import Coulomb, JointElasticity, Stribeck, TimeDelay, TorqueOffset, Viscous
 
 LAW = PD(Kp=[800.0, 600.0, 3000.0, 90.0], Kv=[80.0, 60.0, 300.0, 9.0])
 
@@ -93,6 +99,60 @@ def test_drives_that_are_late_alike_are_a_sampled_law(delays, sampled):
     said = late_drives(scara(), [TorqueOffset(joint=1), *late], period=2e-3)
     assert ("like a law that is sampled" in said) == sampled
     assert late_drives(jaxid.serial(four_joints()), late, period=2e-3) == ""
+
+
+LATE = TimeDelay(joint=1, delay=1e-3)
+
+
+def slide() -> jaxid.ClosedLoop:
+    friction = Viscous(1, 8.0), Coulomb(1, 2.0, smoothing=0.01)
+    law = PD(Kp=[800.0], Kv=[80.0])
+    return jaxid.ClosedLoop(jaxid.arms.Axis(M=2.0), law, friction, name="slide")
+
+
+@pytest.mark.parametrize(
+    ("loop", "effects", "doubtful"),
+    [
+        (slide(), [LATE, TorqueOffset(joint=1), Stribeck(joint=1)], True),
+        (slide(), [LATE, TorqueOffset(joint=1)], False),
+        (slide(), [TorqueOffset(joint=1), Stribeck(joint=1)], False),
+        (scara(), [LATE, TorqueOffset(joint=1), Stribeck(joint=2)], False),
+    ],
+)
+def test_effects_beside_a_single_late_drive_may_approximate_a_sampled_law(loop, effects, doubtful):
+    why, most = one_late_drive(loop, effects, period=2e-3)
+    assert ("like a law that is sampled" in why) == doubtful
+    assert most == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("most", "repeated"), [(1, True), (0, False)])
+def test_a_search_without_the_law_counts_if_it_needs_few_effects(
+    monkeypatch, tmp_path, most, repeated
+):
+    monkeypatch.setattr(_discover, "one_late_drive", lambda *_: ("the law is late, so", most))
+    fit, held_out = slides(seed=1), slides(seed=2)
+    given = {"catalogue": [TorqueOffset], "progress": False, "resume": tmp_path}
+    found = jaxid.discover(slide(), fit, held_out, **given)
+    assert found.verdict == "explained"
+    assert [s.label for s in found.steps] == ["start", "+ torque_offset on joint 1"]
+    assert all(isinstance(s.fit.loop.controller, Tracking) == repeated for s in found.steps)
+    assert any("the law is late, so sets" in note for note in found.notes) == repeated
+
+
+def slides(seed: int) -> list[jaxid.Recording]:
+    """Two recordings of a slide with an offset of its torque."""
+    rng, found = np.random.default_rng(seed), []
+    plant = sim.Axis(M=2.0, Fv=8.0, Fc=2.0, offset=0.5, gamma=100.0)
+    for k in range(2):
+        phases = rng.uniform(0, 6, 3)
+        lines = zip((0.2, 0.08, 0.02), (1.3, 3.1, 8.0), phases, strict=True)
+        law = sim.PD(Kp=(800.0,), Kv=(80.0,), Kg=(1.0,))
+        run = sim.simulate(plant, sim.MultiSine((tuple(lines),)), law, duration=8.0, sample=5e-3)
+        tau = run.tau + 0.05 * rng.standard_normal(run.tau.shape)
+        name = f"slide_{seed}_{k}"
+        found.append(jaxid.Recording(run.time, run.q, tau, q_ref=run.q_ref, name=name))
+    return found
 
 
 def test_drives_are_late_under_a_sampled_law():

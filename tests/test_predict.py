@@ -5,10 +5,12 @@ import dataclasses
 import independent as sim
 import numpy as np
 import pytest
+import scipy
 from independent import effects as fx
 from stories import recordings_of, silent
 
 import jaxid
+from jaxid.discovery.bounded import bounded_amplitudes
 from jaxid.discovery.hypotheses import amplitudes
 from jaxid.discovery.landscape import Landscape
 from jaxid.discovery.predict import Predictor
@@ -112,3 +114,17 @@ def test_entries_beside_a_set_are_those_that_it_lacks(found, predictor):
     pairs = landscape.pairs(None, landscape.beside(None)[:8])
     names = {e.effect.effect_name() for e in pairs[0]}
     assert names == {"stribeck", "spring"}
+
+
+def test_amplitudes_within_bounds_are_those_of_scipy():
+    rng = np.random.default_rng(8)
+    columns, left = rng.standard_normal((2, 40, 3))[0], rng.standard_normal(40)
+    columns[:, 2] -= left
+    gram, score_ = columns.T @ columns, columns.T @ left
+    limits, size = ((0.0,) * 3, (np.inf,) * 3), np.array([2.0, 1.0, 0.5])
+    found, explained = bounded_amplitudes(gram, score_, size, limits)
+    expected, rest = scipy.optimize.nnls(columns, left)
+    assert 0.0 in expected
+    np.testing.assert_allclose(found * size, expected, atol=1e-8)
+    assert explained == pytest.approx(left @ left - rest**2)
+    assert bounded_amplitudes(gram, np.full(3, -1.0), size, limits)[1] == 0.0

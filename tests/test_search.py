@@ -13,7 +13,6 @@ from independent import effects as fx
 from stories import recordings_of, search_of, two_link_of, with_chain
 
 import jaxid
-from jaxid.discovery.bounded import bounded_amplitudes
 from jaxid.discovery.data import Data
 from jaxid.discovery.diagnosis import over_recordings
 from jaxid.discovery.explore import Candidate
@@ -297,20 +296,6 @@ def test_an_amplitude_at_its_bound_does_not_exclude_an_effect(offset_case):
         ]
         bound.append(float(found.loop.effects[-1].drag) < 1e-6)
     assert sorted(bound) == [False, True]
-
-
-def test_amplitudes_within_bounds_are_those_of_scipy():
-    rng = np.random.default_rng(8)
-    columns, left = rng.standard_normal((2, 40, 3))[0], rng.standard_normal(40)
-    columns[:, 2] -= left
-    gram, score_ = columns.T @ columns, columns.T @ left
-    limits, size = ((0.0,) * 3, (np.inf,) * 3), np.array([2.0, 1.0, 0.5])
-    found, explained = bounded_amplitudes(gram, score_, size, limits)
-    expected, rest = scipy.optimize.nnls(columns, left)
-    assert 0.0 in expected
-    np.testing.assert_allclose(found * size, expected, atol=1e-8)
-    assert explained == pytest.approx(left @ left - rest**2)
-    assert bounded_amplitudes(gram, np.full(3, -1.0), size, limits)[1] == 0.0
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """`discover`: the search, the tests of the final model, and the result."""
 
 import dataclasses
-import itertools
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -22,8 +21,8 @@ from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
 from .alongside import along_recorded, in_the_loop, one_late_drive, without_law
 from .asked import Asked, check_apart
-from .comparison import Comparison, compare
 from .diagnosis import over_recordings
+from .held_out import diverges, on_held_out, raised, tested, with_held_out
 from .hypotheses import effect_on
 from .landscape import form
 from .models import Model, Named, named, probability, worth_keeping
@@ -40,14 +39,10 @@ from .verdict import (
     explains_little,
     indefinite,
     misfit_of,
-    on_unseen,
     refuted,
-    risen,
 )
 
 _STOPPED = "the search was interrupted; resume=... continues it from its saved steps"
-# Smallest weight of a model whose error on held-out recordings is computed.
-_SHOWN = 0.01
 
 
 @with_one_blas_thread
@@ -212,10 +207,10 @@ def _told(
 ) -> Discovery:
     """The result of a search, with errors on held-out recordings."""
     models = search.visited.weighed(search.at)
-    steps = _tested(search, _steps(search, models))
-    models = _held_out(search, models, steps)
+    steps = tested(search, _steps(search, models))
+    models = with_held_out(search, models, steps)
     short = _stopped_short(search.asked.most)
-    reason = _STOPPED if interrupted else _diverges(search, steps[-1]) or _raised(search, steps)
+    reason = _STOPPED if interrupted else diverges(search, steps[-1]) or raised(search, steps)
     if not reason:
         reason = _doubt(search, verdict, steps)
         if unfinished and steps[-1].fit.status is Status.converged:
@@ -267,7 +262,7 @@ def _final(search: Search, steps: Sequence[Step]) -> list[Step]:
         search.note("held shapes of the added effects were not estimated: interrupted")
         return list(steps)
     if fit is not last.fit:
-        last = dataclasses.replace(last, fit=fit, held_out=_on_held_out(search, fit))
+        last = dataclasses.replace(last, fit=fit, held_out=on_held_out(search, fit))
     return [*steps[:-1], last]
 
 
@@ -306,31 +301,6 @@ def _doubt(search: Search, verdict: Outcome, steps: Sequence[Step]) -> str:
     return loose or refuted(last.fit, search.at.noise, last.diagnosis, both, worth)
 
 
-def _tested(search: Search, steps: Sequence[Step]) -> list[Step]:
-    """The steps, each with what its effect does to the error on held-out recordings."""
-    found = list(steps[:1])
-    for before, step in itertools.pairwise(steps):
-        if before.held_out is not None and step.held_out is not None:
-            noise, worth = search.at.noise, search.asked.worth
-            unseen = on_unseen(before.held_out, step.held_out, noise, worth)
-            step = dataclasses.replace(step, unseen=unseen)
-        found.append(step)
-    return found
-
-
-def _raised(search: Search, steps: Sequence[Step]) -> str:
-    """A reason that names the effects that raised the held-out error; empty if none did."""
-    seen = [s.held_out for s in steps if s.held_out is not None]
-    noise, worth = search.at.noise, search.asked.worth
-    if len(seen) < 2 or not (reason := risen(seen[0], seen[-1], noise, worth)):
-        return ""
-    culprits = [s for s in steps if s.unseen in ("raises", "mixed")]
-    # The names of all added effects would not add to the reason.
-    some = 0 < len(culprits) < len(seen) - 1
-    said = f"; it rose with {joined([s.label.removeprefix('+ ') for s in culprits])}"
-    return reason + said * some
-
-
 def _without_recordings(asked: Recordings, first: Fit) -> list[str]:
     """A note on recordings that the search left out, because the first fit diverged there."""
     kept = {r.name for r in first.recordings}
@@ -341,40 +311,6 @@ def _without_recordings(asked: Recordings, first: Fit) -> list[str]:
         f"all fits leave out {joined(gone)}, because the simulation of the starting model diverges "
         "there: start from other values, or check the recording"
     ]
-
-
-def _on_held_out(search: Search, fit: Fit) -> Comparison | None:
-    """A fit on the held-out recordings; None if there are none, or if it diverges along them."""
-    if search.asked.held_out is None:
-        return None
-    try:
-        return compare(fit, search.asked.held_out)
-    except FitError as error:
-        search.note(str(error))
-        return None
-
-
-def _diverges(search: Search, last: Step) -> str:
-    """The reason if the final model cannot be simulated along the held-out recordings."""
-    if search.asked.held_out is None or last.held_out is not None:
-        return ""
-    return (
-        "the model diverges when it is simulated along a held-out recording, which a note names: "
-        "check that recording, or fit recordings with motions like it as well"
-    )
-
-
-def _held_out(search: Search, models: Sequence[Model], steps: Sequence[Step]) -> tuple[Model, ...]:
-    """Models with their error on held-out recordings, computed if their weight is large enough."""
-    known = {id(s.fit): s.held_out for s in steps}
-    found = []
-    for m in models:
-        if m.fit is not None and id(m.fit) in known:
-            m = dataclasses.replace(m, held_out=known[id(m.fit)])
-        elif m.fit is not None and m.weight > _SHOWN:
-            m = dataclasses.replace(m, held_out=_on_held_out(search, m.fit))
-        found.append(m)
-    return tuple(found)
 
 
 def _steps(search: Search, weighed: Sequence[Model]) -> list[Step]:
@@ -393,7 +329,7 @@ def _steps(search: Search, weighed: Sequence[Model]) -> list[Step]:
         step = Step(
             label="start",
             fit=model.fit,
-            held_out=_on_held_out(search, model.fit),
+            held_out=on_held_out(search, model.fit),
             diagnosis=search.diagnoses.get(model.key),
         )
         if k:

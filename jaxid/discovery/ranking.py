@@ -32,6 +32,9 @@ _ENOUGH = 50_000
 
 # Largest number of times that noise is separated from the significant hypotheses.
 _TURNS = 4
+# A hypothesis that explains less than this share after the correction explains mostly noise of the
+# recorded motion.
+_OWN = 0.5
 
 
 class Screened(eqx.Module):
@@ -95,6 +98,10 @@ class _Scored(eqx.Module):
         found = corrected_by(changed, self.data, self.noise, self.white, self.gram, hypotheses)
         return dataclasses.replace(self, gram=found.gram, wider=found.wider)
 
+    def explained(self, hypotheses: Sequence[Hypothesis]) -> Float[np.ndarray, " hypotheses"]:
+        """What each hypothesis explains of the residual."""
+        return self.gram.explained([h.columns for h in hypotheses])[0]
+
     def p_values(self, hypotheses: Sequence[Hypothesis]) -> list[float]:
         """The corrected p-value of each hypothesis."""
         found = zip(*self.gram.explained([h.columns for h in hypotheses]), strict=True)
@@ -111,19 +118,24 @@ def _scored(
 
     Signatures with high derivatives of the position explain its noise, and torque noise that is
     separated from them is too small. It is estimated again, separated from those hypotheses only
-    that are significant after the correction.
+    that are significant after the correction; first without those that explain mostly noise of the
+    motion.
     """
     hypotheses, windows = screened.hypotheses, len(screened.data.residual) != len(fit.recordings)
     every = list(range(len(hypotheses)))
     found = _Scored.of(screened, every, windows)
-    p_values = found.p_values(hypotheses)
+    p_values, explained = found.p_values(hypotheses), found.explained(hypotheses)
     changed = changes(fit, found.data, hypotheses, p_values, screened.system.row, say)
     if changed is None:
         return found
     found, apart_from = found.corrected(changed, hypotheses), every
-    for _ in range(_TURNS):
-        before = apart_from
-        apart_from = [k for k, p in enumerate(found.p_values(hypotheses)) if p < significance]
+    # With noise that is separated from them, these would stay significant.
+    noise_of_motion = found.explained(hypotheses) < _OWN * explained
+    for turn in range(_TURNS):
+        before, p_values = apart_from, found.p_values(hypotheses)
+        apart_from = [
+            k for k in every if p_values[k] < significance and (turn or not noise_of_motion[k])
+        ]
         if apart_from == before:
             break
         found = _Scored.of(screened, apart_from, windows).corrected(changed, hypotheses)
