@@ -140,6 +140,24 @@ def test_a_search_without_the_law_counts_if_it_needs_few_effects(
     assert any("the law is late, so sets" in note for note in found.notes) == repeated
 
 
+@pytest.mark.slow
+def test_an_interrupted_search_without_the_law_leaves_the_answer_open(monkeypatch):
+    searched, begun = _discover._searched, []
+
+    def interrupted_again(*given):
+        begun.append(given)
+        if len(begun) > 1:
+            raise KeyboardInterrupt
+        return searched(*given)
+
+    monkeypatch.setattr(_discover, "one_late_drive", lambda *_: ("the law is late, so", 1))
+    monkeypatch.setattr(_discover, "_searched", interrupted_again)
+    found = jaxid.discover(slide(), slides(seed=1), catalogue=[TorqueOffset], progress=False)
+    assert found.interrupted
+    assert found.verdict == "undetermined"
+    assert [s.label for s in found.steps] == ["start", "+ torque_offset on joint 1"]
+
+
 def slides(seed: int) -> list[jaxid.Recording]:
     """Two recordings of a slide with an offset of its torque."""
     rng, found = np.random.default_rng(seed), []

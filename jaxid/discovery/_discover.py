@@ -150,10 +150,13 @@ def _with_and_without_law(
         return story
     say("the same without the law")
     again = Search(asked, campaign, say, live_figure(progress), prefix="without the law, ")
+    stopped = dataclasses.replace(story, verdict="undetermined", interrupted=True, reason=_STOPPED)
     try:
         other = _searched(again, along, started)
     except KeyboardInterrupt:
-        return dataclasses.replace(story, interrupted=True, reason=_STOPPED)
+        return stopped
+    if other.interrupted:
+        return stopped
     if other.verdict not in ("adequate", "explained") or len(other.steps) - 1 > most:
         return story
     note = f"{why} sets of effects are compared along the recorded motion, without the law"
