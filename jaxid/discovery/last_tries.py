@@ -171,7 +171,13 @@ def without_offset(search: Examined, at: Model) -> Model | None:
         if not (search.visited.fitted(effects) or search.small.intersection(key_of(effects))):
             again = partial(search.fits.exchanged, found.loop, effects, effects, found.noise)
             best = _better(search, best, (found.effect,), again)
-    return best if best.score < at.score - LIKELY else None
+    if not best.score < at.score - LIKELY:
+        return None
+    # Filters that were estimated elsewhere cost a model more than such a friction can gain, so the
+    # model is fitted with those of the rival as well.
+    again = partial(search.fits.exchanged, fit.loop, at.effects, at.effects, best.noise)
+    same = _better(search, at, at.effects, again)
+    return best if best.score < same.score - LIKELY else same
 
 
 def _explains_some(search: Examined, at: Model, effect: AbstractEffect) -> bool:
