@@ -11,7 +11,6 @@ import pytest
 
 import jaxid
 from jaxid.control import Tracking
-from jaxid.discovery import motion_noise
 from jaxid.discovery.data import Data
 from jaxid.discovery.motion_noise import Changes, _products
 from jaxid.discovery.score import Whitened
@@ -20,6 +19,7 @@ from jaxid.effects import Coulomb, JointElasticity, Stribeck, TimeDelay, Viscous
 from jaxid.estimate.covariance import covariance_of
 from jaxid.estimate.minimise import Prior
 from jaxid.noise import ARFilter
+from jaxid.signals import encoder
 from jaxid.signals.encoder import position_noise
 from jaxid.simulation.batch import prepare
 from jaxid.simulation.perturbed import with_errors
@@ -98,7 +98,7 @@ def test_p_values_of_clean_recordings_allow_for_the_noise_of_the_motion(monkeypa
     # Six uniform numbers are all above this with a probability of 0.99.
     assert min(least(seed).p_value for seed in range(6)) > 0.0017
     with monkeypatch.context() as patch:
-        patch.setattr(motion_noise, "position_noise", lambda r: np.zeros(1))
+        patch.setattr(encoder, "position_noise", lambda r: np.zeros(1))
         without = least(0)
     assert without.p_value < 1e-6
     assert without.hypothesis.name in ("joint_elasticity", "time_delay")

@@ -116,7 +116,11 @@ def discover(
             resume, {"loop": loop, "search": asked.plan()}, classes_of(loop) | asked.classes()
         ) as campaign,
     ):
-        story = _with_and_without_law(asked, campaign, say, along_recorded(loop), progress, started)
+
+        def begun(prefix: str = "") -> Search:
+            return Search(asked, campaign, say, live_figure(progress), prefix=prefix)
+
+        story = _with_and_without_law(begun, along_recorded(loop), started)
         simulated = imposed(loop) or not imposed(story.fit.loop)
         if simulated or story.interrupted or story.fit.mistake:
             return story
@@ -128,28 +132,28 @@ def discover(
 
 
 def _with_and_without_law(
-    asked: Asked,
-    campaign: Campaign,
-    say: Callable[[str], None],
-    loop: ClosedLoop,
-    progress: bool,
-    started: float,
+    begun: Callable[..., Search], loop: ClosedLoop, started: float
 ) -> Discovery:
     """The result of a search, or of one without the law if effects of it approximate the law.
 
     With one joint a late drive and a sampled law are the same. The law is not the declared one if
     several effects beside the late drive are not needed along the recorded motion.
+
+    **Arguments:**
+
+    - `begun`: function from the prefix of saved steps to a search.
+    - `loop`: the starting model. `started`: time of `time.perf_counter`.
     """
-    story = _with_and_without_standstill(asked, campaign, say, loop, progress, started)
+    story = _with_and_without_standstill(begun, loop, started)
     along = without_law(loop)
     if story.verdict != "explained" or along is loop or imposed(story.fit.loop):
         return story
     effects = [step.added for step in story.steps if step.added is not None]
-    why, most = one_late_drive(loop, effects, asked.recordings.common_period())
+    why, most = one_late_drive(loop, effects, story.fit.recordings.common_period())
     if not why:
         return story
-    say("the same without the law")
-    again = Search(asked, campaign, say, live_figure(progress), prefix="without the law, ")
+    again = begun("without the law, ")
+    again.watched.say("the same without the law")
     stopped = dataclasses.replace(story, verdict="undetermined", interrupted=True, reason=_STOPPED)
     try:
         other = _searched(again, along, started)
@@ -164,15 +168,13 @@ def _with_and_without_law(
 
 
 def _with_and_without_standstill(
-    asked: Asked,
-    campaign: Campaign,
-    say: Callable[[str], None],
-    loop: ClosedLoop,
-    progress: bool,
-    started: float,
+    begun: Callable[..., Search], loop: ClosedLoop, started: float
 ) -> Discovery:
-    """The result of a search, repeated without standstill if the model describes that worst."""
-    search = Search(asked, campaign, say, live_figure(progress))
+    """The result of a search, repeated without standstill if the model describes that worst.
+
+    **Arguments:** those of `_with_and_without_law`.
+    """
+    search = begun()
     story = _searched(search, loop, started)
     done = story.verdict != "undetermined" or story.interrupted
     if done or story.fit.mistake or search.refuted:
@@ -180,10 +182,10 @@ def _with_and_without_standstill(
     slower = worst_at_standstill(story.fit)
     if slower is None:
         return story
-    say("the same without standstill, which the model describes worst")
     # Along the recorded motion, if the first search went on there.
     moving = dataclasses.replace(search.given, standstill=slower)
-    again = Search(asked, campaign, say, live_figure(progress), prefix="moving, ")
+    again = begun("moving, ")
+    again.watched.say("the same without standstill, which the model describes worst")
     if search.why:
         again.note(search.why)
     try:

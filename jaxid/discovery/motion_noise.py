@@ -15,12 +15,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..effects.placed import alike
+from ..effects.placed import Placed, by_structure
 from ..estimate import Fit
 from ..estimate.oem import oem_of
 from ..estimate.pieces import pieces_of
 from ..noise import ARFilter
-from ..signals.encoder import position_noise
+from ..signals.encoder import position_errors
 from ..simulation.dynamics import imposed
 from .comparison import Comparison
 from .data import Data
@@ -74,21 +74,17 @@ def changes(
     if not imposed(fit.loop) or not any(wanted):
         return None
     pieces = pieces_of(fit.recordings, oem_of(fit).window)
-    levels = [position_noise(r) for r in pieces]
-    if not any(np.any(level > 0) for level in levels):
+    drawn = position_errors(pieces, _DRAWS)
+    if not drawn:
         return None
     offered = _together(hypotheses, wanted, fit.loop.joints)
     if any(h.effect.finite for h, there in zip(hypotheses, wanted, strict=True) if there):
         offered += _leading(hypotheses, p_values)
     proposed, kept = [(h.effect, h.tests) for h in offered], set(map(id, offered))
     asked = [h for h, there in zip(hypotheses, wanted, strict=True) if there and id(h) in kept]
-    rng = np.random.default_rng(0)
     residual, base, tables = [], [], []
-    for draw in range(1, _DRAWS + 1):
-        say(f"noise of the recorded motion, draw {draw} of {_DRAWS}")
-        errors = [
-            level * rng.standard_normal(r.q.shape) for r, level in zip(pieces, levels, strict=True)
-        ]
+    for number, errors in enumerate(drawn, start=1):
+        say(f"noise of the recorded motion, draw {number} of {_DRAWS}")
         system = System.of(fit, errors)
         moved, table = signatures(
             system.loop, system.batch, system.linear, proposed, row, lambda _: None
@@ -115,7 +111,7 @@ def _together(
     """Hypotheses by response whose structure has a wanted one; they share a compiled program."""
     direct = [k for k, h in enumerate(hypotheses) if not h.effect.finite]
     found = []
-    for _, places in alike([hypotheses[k].effect for k in direct], joints):
+    for places in by_structure([Placed.of(hypotheses[k].effect, joints) for k in direct]):
         group = [direct[place] for place in places]
         if any(wanted[k] for k in group):
             found += group

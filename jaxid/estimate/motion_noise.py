@@ -7,14 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..recording import Recording
-from ..signals.encoder import position_noise
+from ..signals.encoder import position_errors
 from ..simulation.dynamics import imposed
 from ..simulation.perturbed import with_errors
 from .minimise import Point, Problem, linearisation
-
-# Number of pairs of opposite draws. The terms of first order cancel within a pair, and one pair
-# gives the mean to a tenth.
-_PAIRS = 1
 
 
 def slope_by_motion_noise(
@@ -35,19 +31,17 @@ def slope_by_motion_noise(
     """
     if not imposed(problem.loop):
         return None
-    levels = [position_noise(piece) for piece in pieces]
-    if not any(np.any(level > 0) for level in levels):
+    drawn = position_errors(pieces, 1)
+    if not drawn:
         return None
-    rng, slopes = np.random.default_rng(0), []
-    for _ in range(_PAIRS):
-        errors = [
-            level * rng.standard_normal(piece.q.shape)
-            for piece, level in zip(pieces, levels, strict=True)
-        ]
-        for sign in (1, -1):
-            batch = with_errors(problem.loop, pieces, problem.batch, [sign * e for e in errors])
-            at = linearisation(dataclasses.replace(problem, batch=batch))(point.theta, point.start)
-            slopes.append(_slope(at))
+    # The terms of first order cancel in a pair of opposite errors, and one pair gives the mean to a
+    # tenth.
+    slopes = []
+    for sign in (1, -1):
+        errors = [sign * error for error in drawn[0]]
+        batch = with_errors(problem.loop, pieces, problem.batch, errors)
+        at = linearisation(dataclasses.replace(problem, batch=batch))(point.theta, point.start)
+        slopes.append(_slope(at))
     found = np.mean(slopes, axis=0) - _slope(point)
     return found if np.isfinite(found).all() else None
 

@@ -1,5 +1,7 @@
 """Noise of recorded positions."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
@@ -36,3 +38,26 @@ def position_noise(recording: Recording) -> Float[np.ndarray, " joints"]:
     there = (f > _ABOVE * rate) & (f < _UNTIL * rate)
     # The median of an exponential distribution is log(2) times its mean.
     return np.sqrt(np.median(power[there], axis=0) / np.log(2))
+
+
+def position_errors(
+    recordings: Sequence[Recording], draws: int
+) -> list[list[Float[np.ndarray, "_samples joints"]]]:
+    """Errors as strong as the noise of the recorded positions, rad or m; the same in each call.
+
+    **Arguments:**
+
+    - `draws`: number of independent draws.
+
+    **Returns:** for each draw the errors of each recording; empty if no recording has noise.
+    """
+    levels, rng = [position_noise(r) for r in recordings], np.random.default_rng(0)
+    if not any(np.any(level > 0) for level in levels):
+        return []
+    return [
+        [
+            level * rng.standard_normal(r.q.shape)
+            for r, level in zip(recordings, levels, strict=True)
+        ]
+        for _ in range(draws)
+    ]
