@@ -16,7 +16,7 @@ NAMELESS = ("rigid", "Gaussian process", "network")
 CLAIMS = (0.0, 0.5, 0.7, 0.9, 0.99, 1.0)
 # Smallest probability of an effect that the models of an answer share.
 _LIKELY = 0.05
-WORLDS = ("friction", "noise", "robot", "law")
+WORLDS = ("world", "friction", "noise", "robot", "law")
 
 
 def interval(right: int, of: int) -> tuple[float, float]:

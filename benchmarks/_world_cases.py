@@ -11,9 +11,17 @@ from scipy import signal
 
 import jaxid
 
+from ._world_departures import (
+    WORLDS,
+    draw_length,
+    draw_motions,
+    draw_world,
+    logged_ticks,
+)
 from ._world_physics import (
     EFFECTS,
     FRICTIONS,
+    LARGER,
     OUTSIDE,
     ROBOTS,
     TURNING,
@@ -48,6 +56,7 @@ class Wanted:
     law: str
     # Joint of the effects, from 1; None for a random one.
     joint: int | None = None
+    world: str = "plain"
 
     @property
     def label(self) -> str:
@@ -68,6 +77,8 @@ class Case:
     strength: tuple[tuple[float, float], ...]
     # Each effect's torque on its joint along each recording, `(samples,)`.
     torques: tuple[dict[str, np.ndarray], ...]
+    # Whether samples are missing.
+    uneven: bool = False
 
 
 def draw_wanted(
@@ -78,16 +89,24 @@ def draw_wanted(
     effect: str | None = None,
     joint: int | None = None,
     frictions: Sequence[str] = FRICTIONS,
+    world: str = "plain",
 ) -> list[Wanted]:
     """`count` cases, each with every law: six of ten with one effect, two of ten clean; all of one
-    effect if it is given."""
+    effect if it is given.
+
+    A quarter of the robots outside the plain world have three joints.
+    """
     rng = np.random.default_rng(master)
+    # Cases of the plain world do not depend on the draws of the others.
+    others = np.random.default_rng([master, 1])
     wanted = []
     for number in range(count):
         kind = KINDS[int(rng.choice(4, p=(0.6, 0.1, 0.2, 0.1)))]
         if effect is not None:
             kind = "outside" if effect in OUTSIDE else "single"
         chosen = str(rng.choice(ROBOTS)) if robot == "any" else robot
+        where, larger = str(others.choice(WORLDS)), others.random() < 0.25
+        where = where if world == "any" else world
         turns = chosen not in ("axis", "gantry")
         known = [e for e in EFFECTS if turns or e not in TURNING]
         strange = [e for e in OUTSIDE if chosen not in ("axis", "pendulum") or e != "cross_bump"]
@@ -99,8 +118,11 @@ def draw_wanted(
             str(rng.choice(list(frictions))),
             str(rng.choice(NOISES)),
         )
+        noise = "drifting" if where == "drift" else noise
+        if robot == "any" and where != "plain" and larger:
+            chosen = str(others.choice(LARGER))
         wanted += [
-            Wanted(number, kind, seed, tuple(names), chosen, friction, noise, law, joint)
+            Wanted(number, kind, seed, tuple(names), chosen, friction, noise, law, joint, where)
             for law in laws
         ]
     return wanted
@@ -116,11 +138,15 @@ def make(wanted: Wanted) -> Case:
 
 def _made(wanted: Wanted) -> Case:
     rng = np.random.default_rng(wanted.seed)
+    others = np.random.default_rng([wanted.seed, 1])
     robot = draw_robot(rng, wanted.robot)
     m = inertias(robot)
     rate, duration = int(rng.choice([200, 250, 500])), float(rng.uniform(10.0, 20.0))
     pace = math.exp(rng.uniform(math.log(0.6), math.log(2.0)))
     kinds = rng.permutation(["sines", "sines", "moves"]).tolist()
+    if wanted.world != "plain":
+        rate, duration = draw_length(others)
+        kinds = draw_motions(others)
     references = [draw_reference(rng, robot, duration, kind, pace) for kind in kinds]
     speeds = [_speed(reference, duration) for reference in references]
     speed = np.max(speeds, axis=0)
@@ -135,6 +161,7 @@ def _made(wanted: Wanted) -> Case:
         )
         for j in range(len(m))
     )
+    world = draw_world(others, wanted.world, robot, frictions, m, speed, load, duration)
     bandwidth = 2 * math.pi * rng.uniform(4.0, 9.0, len(m))
     integral = float(rng.choice([0.0, 0.3]))
     law = Law(
@@ -145,14 +172,19 @@ def _made(wanted: Wanted) -> Case:
             link.travel * math.exp(rng.uniform(math.log(1e-7), math.log(3e-6)))
             for link in robot.links
         ),
+        delay=world.delay,
     )
-    clean = [simulate(robot, frictions, law, r, duration) for r in references[:1]]
-    level = rng.uniform(0.004, 0.02) * np.std(clean[0].tau, axis=0)
-    hidden = _hidden(rng, wanted, robot, frictions, speed, duration, clean[0], level)
-    runs = [simulate(robot, frictions, law, r, duration, hidden) for r in references]
+    clean = simulate(robot, world.frictions, law, references[0], duration, world.beside)
+    level = rng.uniform(0.004, 0.02) * np.std(clean.tau, axis=0)
+    hidden = _hidden(rng, wanted, robot, frictions, speed, duration, clean, level)
+    acting = (*world.beside, *hidden)
+    runs = [simulate(robot, world.frictions, law, r, duration, acting) for r in references]
+    logged = [
+        logged_ticks(others, len(run.time), 1000 // rate, uneven=world.uneven) for run in runs
+    ]
     recordings = {
-        name: _recorded(rng, run, rate, level, wanted.noise)
-        for name, run in zip(NAMES, runs, strict=True)
+        name: _recorded(rng, run, ticks, rate, level, wanted.noise)
+        for name, run, ticks in zip(NAMES, runs, logged, strict=True)
     }
     wrong = rng.uniform(0.8, 1.25, (len(m), 3))
     along = [[_along(e, run) for run in runs] for e in hidden]
@@ -161,10 +193,10 @@ def _made(wanted: Wanted) -> Case:
         for e, waves in zip(hidden, along, strict=True)
     )
     torques = tuple(
-        {name: wave[:: 1000 // rate] for name, wave in zip(NAMES, waves, strict=True)}
+        {name: wave[ticks] for name, wave, ticks in zip(NAMES, waves, logged, strict=True)}
         for waves in along
     )
-    return Case(robot, law, hidden, robot.urdf(wrong), recordings, strength, torques)
+    return Case(robot, law, hidden, robot.urdf(wrong), recordings, strength, torques, world.uneven)
 
 
 def _speed(reference, duration: float) -> np.ndarray:
@@ -174,10 +206,9 @@ def _speed(reference, duration: float) -> np.ndarray:
 
 def _along(effect: Hidden, run: Signals) -> np.ndarray:
     """The effect's torque along a run, `(ticks,)`."""
-    effect.state = 0.0
-    size = effect.size or 1.0
+    effect.reset()
     rows = zip(run.time, run.q.tolist(), run.speed.tolist(), run.tau.tolist(), strict=True)
-    return np.array([size * effect.shape(t, q, v, tau, 1e-3) for t, q, v, tau in rows])
+    return np.array([effect.torque(t, q, v, tau, 1e-3) for t, q, v, tau in rows])
 
 
 def _hidden(rng, wanted, robot, frictions, speed, duration, clean, level) -> tuple[Hidden, ...]:
@@ -203,24 +234,28 @@ def _hidden(rng, wanted, robot, frictions, speed, duration, clean, level) -> tup
 
 
 def _recorded(
-    rng: np.random.Generator, run: Signals, rate: int, level: np.ndarray, noise: str
+    rng: np.random.Generator,
+    run: Signals,
+    ticks: np.ndarray,
+    rate: int,
+    level: np.ndarray,
+    noise: str,
 ) -> dict[str, np.ndarray]:
-    """The logged run: at `rate`, with noise in the torque.
+    """The logged run: at these ticks, with noise in the torque.
 
     `aliased` is the part of the logged torque, without noise, that is due to frequencies too high
     for `rate`: a law on encoder steps has a broad spectrum, of which a logger without an
     anti-aliasing filter takes samples.
     """
-    every = 1000 // rate
-    tau = run.tau[::every]
+    tau = run.tau[ticks]
     errors = _noise(rng, tau.shape, noise) * level
     sections = signal.butter(8, 0.4 * rate, fs=1000, output="sos")
-    resolved = signal.sosfiltfilt(sections, run.tau, axis=0)[::every]
+    resolved = signal.sosfiltfilt(sections, run.tau, axis=0)[ticks]
     return {
-        "time": run.time[::every],
-        "q": run.q[::every],
+        "time": run.time[ticks],
+        "q": run.q[ticks],
         "tau": tau + errors,
-        "q_ref": run.q_ref[::every],
+        "q_ref": run.q_ref[ticks],
         "noise": errors,
         "aliased": tau - resolved,
     }
@@ -232,6 +267,11 @@ def _noise(rng: np.random.Generator, shape: tuple[int, ...], kind: str) -> np.nd
     if kind == "coloured":
         pole = rng.uniform(0.5, 0.9)
         return signal.lfilter([math.sqrt(1 - pole**2)], [1.0, -pole], white, axis=0)
+    if kind == "drifting":
+        # Half of it changes within some hundred samples.
+        pole = 1.0 - 1.0 / rng.uniform(100.0, 400.0)
+        slow = signal.lfilter([math.sqrt(1 - pole**2)], [1.0, -pole], white, axis=0)
+        return math.sqrt(0.5) * (slow + rng.standard_normal(shape))
     if kind == "heavy":
         return rng.standard_t(4.0, shape) / math.sqrt(2.0)
     if kind == "bursts":
@@ -262,6 +302,7 @@ def start_model(case: Case, law: str) -> jaxid.ClosedLoop:
             resolution=np.array(known.resolution),
             velocity="difference",
             cutoff=known.cutoff,
+            delay=known.delay,
         ),
     }[law]
     return jaxid.serial(case.drawn, controller, bodies="free")
@@ -277,5 +318,8 @@ def read_case(folder: Path, case: Case) -> tuple[jaxid.Recordings, jaxid.Recordi
         np.savetxt(
             folder / f"{name}.csv", table, "%.8g", ",", header=",".join(columns), comments=""
         )
-    fitting = jaxid.read(folder / "fit_1.csv", folder / "fit_2.csv")
-    return jaxid.Recordings.of(fitting), jaxid.Recordings.of(jaxid.read(folder / "held_out.csv"))
+    files = [folder / f"{name}.csv" for name in NAMES]
+    # What a user passes who has read that samples are missing.
+    gaps = "allow" if case.uneven else "refuse"
+    fitting, held_out = jaxid.read(*files[:2], gaps=gaps), jaxid.read(files[2], gaps=gaps)
+    return jaxid.Recordings.of(fitting), jaxid.Recordings.of(held_out)

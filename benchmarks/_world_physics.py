@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 ROBOTS = ("planar", "scara", "polar", "gantry", "axis", "pendulum")
+# Arms of three joints; not among those of the plain world.
+LARGER = ("elbow",)
 FRICTIONS = ("tanh", "root", "arctan", "dry")
 EFFECTS = (
     "stribeck",
@@ -90,7 +92,7 @@ def draw_robot(rng: np.random.Generator, name: str) -> Robot:
     """A robot of a kind with random masses, lengths and rotors."""
     turn = {"planar": (0.0, 1.0, 0.0), "pendulum": (0.0, 1.0, 0.0)}.get(name, (0.0, 0.0, 1.0))
 
-    def turning(at: float) -> Link:
+    def turning(at: float, turn: tuple[float, float, float] = turn) -> Link:
         mass, length = rng.uniform(1.0, 5.0), rng.uniform(0.25, 0.5)
         sideways = rng.uniform(-0.02, 0.02)
         # Down for arms under gravity, along x for the others.
@@ -108,7 +110,14 @@ def draw_robot(rng: np.random.Generator, name: str) -> Robot:
         return Link(True, axis, (0.0, 0.0, 0.0), mass, centre, 0.02, rotor, travel)
 
     along_x, along_y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+    upright, sideways = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
     links = {
+        # A turning base that carries an arm under gravity.
+        "elbow": lambda: (
+            turning(0.0, upright),
+            turning(0.0, sideways),
+            turning(rng.uniform(0.25, 0.5), sideways),
+        ),
         "planar": lambda: (turning(0.0), turning(rng.uniform(0.25, 0.5))),
         "scara": lambda: (turning(0.0), turning(rng.uniform(0.25, 0.5))),
         "polar": lambda: (turning(0.0), sliding(along_x)),
@@ -162,6 +171,16 @@ class Hidden:
     size: float = 0.0
     # State of effects with memory.
     state: float = 0.0
+
+    def reset(self) -> None:
+        """The state at rest."""
+        self.state = 0.0
+
+    def torque(
+        self, t: float, q: Sequence[float], v: Sequence[float], tau: Sequence[float], dt: float
+    ) -> float:
+        """The torque; with a size of one before the size is known."""
+        return (self.size or 1.0) * self.shape(t, q, v, tau, dt)
 
     def shape(
         self, t: float, q: Sequence[float], v: Sequence[float], tau: Sequence[float], dt: float
@@ -240,7 +259,8 @@ def draw_shape(rng: np.random.Generator, name: str, duration: float) -> dict[str
 
 @dataclass(frozen=True)
 class Reference:
-    """Reference positions: sums of sines, or moves from point to point with rests between."""
+    """Reference positions: sums of sines; moves from point to point with rests between; pulses
+    from one place and back; or a slow motion that pauses, as if guided by hand."""
 
     kind: str
     parts: tuple[tuple[tuple[float, float, float], ...], ...] = field(default=())
@@ -248,16 +268,22 @@ class Reference:
 
     def at(self, t: float) -> list[float]:
         """Positions of all joints, rad or m."""
-        if self.kind == "sines":
+        if self.kind in ("sines", "guided"):
             rise = min(1.0, t / 1.5)
             rise = rise**3 * (10 - 15 * rise + 6 * rise**2)
+            # Guided motion pauses at the end of each hold.
+            pace = 2 * math.pi / self.hold
+            s = t if self.kind == "sines" else t - math.sin(pace * t) / pace
             return [
-                rise * sum(a * math.sin(w * t + p) for a, w, p in joint) for joint in self.parts
+                rise * sum(a * math.sin(w * s + p) for a, w, p in joint) for joint in self.parts
             ]
         k, s = int(t / self.hold), t % self.hold
         positions = []
         for joint in self.parts:
             here, moving, _ = joint[min(k, len(joint) - 1)]
+            if self.kind == "pulses":
+                positions.append(here * math.sin(math.pi * min(1.0, s / moving)) ** 2)
+                continue
             before = joint[k - 1][0] if 0 < k <= len(joint) else 0.0
             x = min(1.0, s / moving)
             positions.append(before + (here - before) * x**3 * (10 - 15 * x + 6 * x**2))
@@ -269,16 +295,18 @@ def draw_reference(
 ) -> Reference:
     """A motion within the robot's travel; `pace` is the highest frequency of the sines, Hz."""
     parts = []
+    pace = pace / 4 if kind == "guided" else pace
+    hold = 4.0 if kind == "guided" else 1.5
     for link in robot.links:
-        if kind == "sines":
-            rates = 2 * math.pi * np.exp(rng.uniform(np.log(0.1), np.log(pace), 6))
+        if kind in ("sines", "guided"):
+            rates = 2 * math.pi * np.exp(rng.uniform(np.log(min(0.1, pace / 3)), np.log(pace), 6))
             sizes = rng.uniform(0.4, 1.0, 6) / (1.0 + (rates / (math.pi * pace)) ** 2)
             sizes *= link.travel / np.sum(sizes) * 1.3
             phases = rng.uniform(0, 2 * math.pi, 6)
             parts.append(tuple(zip(sizes.tolist(), rates.tolist(), phases.tolist(), strict=True)))
         else:
-            hold = 1.5
             levels = rng.uniform(-link.travel, link.travel, int(duration / hold) + 2)
+            # A pulse goes and returns in this time.
             moving = rng.uniform(0.6, 1.0) * hold
             parts.append(tuple((float(x), moving, 0.0) for x in levels))
-    return Reference(kind, tuple(parts))
+    return Reference(kind, tuple(parts), hold)

@@ -79,6 +79,8 @@ def read_lines(paths: Iterable[Path]) -> list[dict[str, Any]]:
             try:
                 line = json.loads(text)
                 line["tool"], line["run"]["seed"], line["number"]
+                # Files of the first runs have the plain world only.
+                line.setdefault("world", "plain")
             except (ValueError, KeyError, TypeError) as error:
                 raise ValueError(
                     f"{path.name}, line {number}: no case of a result file ({error!r}); give files "

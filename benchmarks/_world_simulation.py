@@ -3,11 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import mujoco
 import numpy as np
 
-from ._world_physics import Friction, Hidden, Reference, Robot
+from ._world_physics import Friction, Reference, Robot
 
 STEP = 1e-4
 TICK = 10  # steps
@@ -19,13 +20,33 @@ class Undrawable(ValueError):
 
 @dataclass(frozen=True)
 class Law:
-    """PD, optionally with integral, at 1 kHz from encoders; velocity by low-passed difference."""
+    """PD, optionally with integral, at 1 kHz from encoders; velocity by low-passed difference.
+
+    A command acts `delay` ticks after its reading.
+    """
 
     Kp: tuple[float, ...]
     Ki: tuple[float, ...]
     Kd: tuple[float, ...]
     resolution: tuple[float, ...]
     cutoff: float = 150.0
+    delay: int = 0
+
+
+class Acting(Protocol):
+    """A torque on a joint (from 0) that opposes the drive."""
+
+    joint: int
+
+    def reset(self) -> None:
+        """The state at rest."""
+        ...
+
+    def torque(
+        self, t: float, q: Sequence[float], v: Sequence[float], tau: Sequence[float], dt: float
+    ) -> float:
+        """The torque, N·m or N, after a step of time."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -69,22 +90,23 @@ def simulate(
     law: Law,
     reference: Reference,
     duration: float,
-    hidden: Sequence[Hidden] = (),
+    others: Sequence[Acting] = (),
 ) -> Signals:
-    """A run from rest; commanded torque is held between ticks, and acts without delay.
+    """A run from rest; commanded torque is held between ticks.
 
     **Raises:** `Undrawable` if the simulation diverges.
     """
     model = loaded(robot, frictions)
     data = mujoco.MjData(model)
     n = len(robot.links)
-    for effect in hidden:
-        effect.state = 0.0
+    for other in others:
+        other.reset()
     ticks = round(duration * 1000)
     rows: dict[str, list] = {"q": [], "tau": [], "q_ref": [], "speed": []}
     before, speed, integral = [0.0] * n, [0.0] * n, [0.0] * n
     smooth = 1.0 - math.exp(-2 * math.pi * law.cutoff * STEP * TICK)
     period = STEP * TICK
+    waiting = [[0.0] * n] * law.delay
     for k in range(ticks):
         asked = reference.at(k * period)
         ahead = reference.at((k + 1) * period)
@@ -100,13 +122,15 @@ def simulate(
         for name, row in (("q", q), ("tau", tau), ("q_ref", asked)):
             rows[name].append(row)
         rows["speed"].append(data.qvel.tolist())
+        waiting.append(tau)
+        drive = waiting.pop(0)
         for step in range(TICK):
             t, at, v = k * period + step * STEP, data.qpos.tolist(), data.qvel.tolist()
-            acting = list(tau)
+            acting = list(drive)
             for j, friction in enumerate(frictions):
                 acting[j] -= friction.coulomb * friction.sign(v[j])
-            for effect in hidden:
-                acting[effect.joint] -= effect.size * effect.shape(t, at, v, tau, STEP)
+            for other in others:
+                acting[other.joint] -= other.torque(t, at, v, drive, STEP)
             data.qfrc_applied[:] = acting
             mujoco.mj_step(model, data)
     arrays = {name: np.array(row) for name, row in rows.items()}

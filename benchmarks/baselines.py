@@ -4,8 +4,9 @@ Stepwise regression, pysindy, gplearn, a Gaussian process and a small network ex
 of the rigid robot with friction (SciPy's filters, Pinocchio's regressor), on the recordings that
 `benchmarks.worlds` makes from the same seed. Torque errors are in the band of an unknown law.
 
-python -m benchmarks.baselines [--seed N] [--quick] [--count 40] [--robot NAME] [--tool NAME]
-                               [--jobs 1] [--out DIR] [--results FILE] [--json FILE] [--case N]
+python -m benchmarks.baselines [--seed N] [--quick] [--count 40] [--world NAME|any] [--robot NAME]
+                               [--tool NAME] [--jobs 1] [--out DIR] [--results FILE] [--json FILE]
+                               [--case N]
 """
 
 import argparse
@@ -31,7 +32,8 @@ from ._baseline_rows import Motion, Table, residual, table_of
 from ._baseline_tools import TOOLS, Found
 from ._evidence_tables import by_tool
 from ._world_cases import Case, Wanted, draw_wanted, make, read_case, start_model, unexplained
-from ._world_physics import ROBOTS
+from ._world_departures import WORLDS
+from ._world_physics import LARGER, ROBOTS
 from ._world_results import append, origin
 from .hidden_effects import configure_jax, floor_percent
 from .worlds import Key, names_right
@@ -158,9 +160,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the bench; see the module's first lines."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, help="of everything; drawn anew if not given")
-    parser.add_argument("--quick", action="store_true", help="two cases of one joint")
+    parser.add_argument("--quick", action="store_true", help="two cases of one joint, plain")
     parser.add_argument("--count", type=int, default=40)
-    parser.add_argument("--robot", choices=(*ROBOTS, "any"), default="any")
+    parser.add_argument("--world", choices=(*WORLDS, "any"), default="any")
+    parser.add_argument("--robot", choices=(*ROBOTS, *LARGER, "any"), default="any")
     parser.add_argument("--tool", choices=tuple(TOOLS), action="append", help="only this one")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder in which a stopped run continues")
@@ -172,9 +175,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise SystemExit(f"{', '.join(missing)} not found: install the extra `baselines`")
     drawn = 1 if given.quick else secrets.randbits(31)
     seed = drawn if given.seed is None else given.seed
-    count, robot = (2, "axis") if given.quick else (given.count, given.robot)
+    count, robot, world = given.count, given.robot, given.world
+    if given.quick:
+        count, robot, world = 2, "axis", "plain"
     tools = tuple(given.tool or TOOLS)
-    cases = draw_wanted(seed, count, (LAW,), robot)
+    cases = draw_wanted(seed, count, (LAW,), robot, world=world)
     wanted = {w.label: w for w in cases if given.case is None or w.number in given.case}
     out = given.out or Path(tempfile.mkdtemp(prefix="baselines_"))
     print(f"seed {seed}, {len(wanted)} cases, results in {out}", flush=True)
@@ -182,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     work = partial(run_case, seed=seed, tools=tools)
     file = nullcontext() if given.results is None else given.results.open("w", encoding="utf-8")
     records: list[dict[str, Any]] = []
-    plan = {"seed": seed, "robot": robot, "tools": list(tools)}
+    plan = {"seed": seed, "robot": robot, "world": world, "tools": list(tools)}
     with Campaign(out, plan) as campaign, file as written:
         for label, record in campaign.run(work, wanted, jobs=given.jobs):
             if isinstance(record, Failed):

@@ -183,6 +183,7 @@ def _line(tool: str, seed: int, kind: str = "single", **more: Any) -> dict[str, 
         "effects": ["spring"] * hidden,
         "truth": [{"effect": "spring", "joint": 1}] * hidden,
         "robot": "axis",
+        "world": "plain",
         "friction": "tanh",
         "noise": "white",
         "law": "unknown",
@@ -263,46 +264,6 @@ def test_evidence_leaves_hand_written_text_and_draws_the_curves(tmp_path):
     page.write_text("no marks")
     with pytest.raises(ValueError, match="no place for worlds"):
         evidence.main([str(file), *pages])
-
-
-def test_worlds_tell_what_a_logger_aliases():
-    """A line above half the logger's rate appears at their difference, and belongs to the noise."""
-    if not (ROOT / "benchmarks").is_dir():
-        pytest.skip("no benchmarks beside the tests: they are part of a checkout alone")
-    from benchmarks._world_cases import _recorded, unexplained
-    from benchmarks._world_simulation import Signals
-
-    time = np.arange(20000) / 1000
-    motion, chatter = np.sin(2 * np.pi * 3 * time), 0.1 * np.sin(2 * np.pi * 305 * time)
-    still = np.zeros((len(time), 1))
-    run = Signals(time, still, (motion + chatter)[:, None], still, still)
-    seen = _recorded(np.random.default_rng(1), run, 250, np.array([0.01]), "white")
-    middle = slice(500, -500)
-    expected = (chatter[::4])[middle]
-    np.testing.assert_allclose(seen["aliased"][middle, 0], expected, atol=1e-4)
-    line = np.abs(np.fft.rfft(seen["aliased"][middle, 0]))
-    assert np.fft.rfftfreq(len(expected), 1 / 250)[np.argmax(line)] == pytest.approx(55, abs=0.1)
-    left = seen["tau"] - motion[::4, None] - unexplained(seen, along_motion=True)
-    assert abs(left[middle]).max() < 1e-4
-    np.testing.assert_array_equal(unexplained(seen, along_motion=False), seen["noise"])
-
-
-def test_a_world_whose_effect_does_not_act_is_drawn_again():
-    pytest.importorskip("mujoco")
-    if not (ROOT / "benchmarks").is_dir():
-        pytest.skip("no benchmarks beside the tests: they are part of a checkout alone")
-    from benchmarks import _world_cases as cases
-    from benchmarks._world_simulation import Signals, Undrawable
-
-    rng = np.random.default_rng(1)
-    robot = cases.draw_robot(rng, "axis")
-    friction = cases.Friction(1.0, 1.0, "tanh", 0.01)
-    still = np.zeros((1000, 1))
-    run = Signals(np.arange(1000) / 1000, still, still, still, still)
-    wanted = cases.Wanted(0, "single", 1, ("end_stop",), "axis", "tanh", "white", "unknown")
-    one = np.ones(1)
-    with pytest.raises(Undrawable, match="end_stop on joint 1 does not act"):
-        cases._hidden(rng, wanted, robot, (friction,), one, 1.0, run, one)
 
 
 def test_baselines_answer_on_the_recordings_of_the_worlds(tmp_path):
