@@ -40,6 +40,8 @@ NOISES = ("white", "coloured", "heavy", "bursts")
 NAMES = ("fit_1", "fit_2", "held_out")
 # Draws of a case, until one can be simulated and its effects act.
 _DRAWS = 20
+# Torque of a stable run over that of the first one without the effect, at most.
+_UNSTABLE = 30.0
 
 
 @dataclass(frozen=True)
@@ -179,6 +181,8 @@ def _made(wanted: Wanted) -> Case:
     hidden = _hidden(rng, wanted, robot, frictions, speed, duration, clean, level)
     acting = (*world.beside, *hidden)
     runs = [simulate(robot, world.frictions, law, r, duration, acting) for r in references]
+    if any(np.any(np.std(r.tau, axis=0) > _UNSTABLE * np.std(clean.tau, axis=0)) for r in runs):
+        raise Undrawable(f"the control of {robot.name} is unstable with {wanted.effects}")
     logged = [
         logged_ticks(others, len(run.time), 1000 // rate, uneven=world.uneven) for run in runs
     ]

@@ -10,7 +10,7 @@ from stories import recordings_of, scene_of, search_of
 
 import jaxid
 from jaxid.discovery.hypotheses import survey
-from jaxid.effects import EndStop, Motion, Stribeck, ThermalDrift, Viscous
+from jaxid.effects import EndStop, Hysteresis, LuGre, Motion, Stribeck, ThermalDrift, Viscous
 
 
 @pytest.mark.parametrize(
@@ -43,6 +43,17 @@ def test_a_stop_leaves_a_part_of_the_travel_free(side, share, expected):
     angle = high - share * travel if side > 0 else low + share * travel
     stop = EndStop(joint=1, stiffness=40.0, angle=angle, side=side)
     assert stop.genuine(scene, []) is expected
+
+
+@pytest.mark.parametrize("kind", [Hysteresis, LuGre])
+def test_a_bristle_bends_for_longer_than_a_sample(kind):
+    """Compared with the way of a sine within a sample after its reversal."""
+    scene = scene_of(3.0)
+    amplitude = scene.travel(1) / 2
+    rate = float(scene.speed[0]) / amplitude
+    way = amplitude * (1 - np.cos(rate * scene.period))
+    assert kind(joint=1, slide=1.01 * way).genuine(scene, [])
+    assert not kind(joint=1, slide=0.99 * way).genuine(scene, [])
 
 
 @pytest.mark.parametrize(

@@ -59,6 +59,31 @@ def test_an_exponent_is_estimated_at_the_end(ended):
     assert table.loc["Fs1", "std"] < 0.2 * PEAK
 
 
+def bell(v):
+    """A sign of velocity with a peak that falls as a Gaussian of speed, the default shape."""
+    return np.tanh(v / WIDTH) * (1 + PEAK / DRY * np.exp(-((v / SPEED) ** 2)))
+
+
+def test_a_shape_that_the_recordings_do_not_contradict_stays_and_makes_values_less_certain():
+    """The values of the fit with a free shape would only follow the noise."""
+    width = WIDTH * np.arctanh(0.5)
+    peak = Stribeck(1, 1.0, 0.03, smoothing=width, form=1.0)
+    friction = Coulomb(1, 3.0, smoothing=width, form=1.0)
+    loop = axis().without("coulomb").add(friction, peak)
+    refits = Refits(jaxid.Recordings.of([recorded(k, bell) for k in (1, 2)]), jaxid.OEM())
+    noise = (ARFilter(np.zeros(0), 1e-3),)
+    held = refits.filtered(loop, noise)
+    model = Model((held.loop.effects[-1],), 0.0, fit=held, noise=noise)
+    found = with_shapes(Fits(refits, Campaign(None, {})), model)
+    np.testing.assert_array_equal(found.theta, held.theta)
+    assert "ds1" not in found.names
+    assert np.all(found.std >= held.std * (1 - 1e-9))
+    k = found.names.index("Fs1")
+    assert found.std[k] > 1.5 * held.std[k]
+    assert abs(found.theta[k] - PEAK) < 3 * found.std[k]
+    assert any("do not contradict the default ds1 of 2" in note for note in found.notes)
+
+
 def test_effects_without_a_held_shape_keep_their_fit(ended):
     refits, model = ended
     without = dataclasses.replace(model, effects=())

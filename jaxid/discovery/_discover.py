@@ -40,6 +40,7 @@ from .verdict import (
     indefinite,
     misfit_of,
     refuted,
+    refuted_unseen,
 )
 
 _STOPPED = "the search was interrupted; resume=... continues it from its saved steps"
@@ -224,15 +225,15 @@ def _told(
             reason = short
     reason = reason or search.refuted
     if (reason and not interrupted) or verdict == "outside_catalogue":
-        # Probabilities assume that one of the examined models is right.
-        steps = [s if s.added is None else dataclasses.replace(s, probability=None) for s in steps]
+        steps = _without_probabilities(steps)
     elif not reason:
         alike = {named(s.added): s.alike for s in steps if s.added is not None}
         chosen = next((m for m in models if m.key == search.at.key), search.at)
         reason = undecided(models, chosen, alike, search.asked.worth)
     if not interrupted and not reason and search.at.effects:
-        steps = _final(search, steps)
+        steps, reason = _final(search, steps)
         models = tuple(_as_shown(m, steps[-1]) if m.fit is search.at.fit else m for m in models)
+        steps = _without_probabilities(steps) if reason else steps
     notes = (*remarks(steps, search.given, search.offsets), *search.failures)
     notes = (*_without_recordings(search.asked.recordings, steps[0].fit), *notes)
     if unfinished and reason != short:
@@ -250,11 +251,20 @@ def _told(
     )
 
 
-def _final(search: Search, steps: Sequence[Step]) -> list[Step]:
-    """The steps, the last one without needless parts of added effects and with their shapes free.
+def _without_probabilities(steps: Sequence[Step]) -> list[Step]:
+    """The steps of an answer that is in doubt.
 
-    The tests of the model are those with the shapes held: beside a free shape the size of an effect
-    can be uncertain although the effect is not.
+    Probabilities assume that one of the examined models is right.
+    """
+    return [s if s.added is None else dataclasses.replace(s, probability=None) for s in steps]
+
+
+def _final(search: Search, steps: Sequence[Step]) -> tuple[list[Step], str]:
+    """The steps, the last one without needless parts of added effects and with their shapes free,
+    and a reason if held-out recordings refute that last fit.
+
+    The other tests of the model are those with the shapes held: beside a free shape the size of an
+    effect can be uncertain although the effect is not.
     """
     search.watched.begin("fit", "fits with the shapes of added effects free")
     last = steps[-1]
@@ -265,10 +275,15 @@ def _final(search: Search, steps: Sequence[Step]) -> list[Step]:
         fit = with_shapes(search.fits, dataclasses.replace(search.at, fit=needed))
     except KeyboardInterrupt:
         search.note("held shapes of the added effects were not estimated: interrupted")
-        return list(steps)
-    if fit is not last.fit:
-        last = dataclasses.replace(last, fit=fit, held_out=on_held_out(search, fit))
-    return [*steps[:-1], last]
+        return list(steps), ""
+    if fit is last.fit:
+        return list(steps), ""
+    unseen = on_held_out(search, fit)
+    last, reason = dataclasses.replace(last, fit=fit, held_out=unseen), ""
+    if steps[0].held_out is not None and unseen is not None:
+        noise, worth = search.at.noise, search.asked.worth
+        reason = refuted_unseen(fit, noise, steps[0].held_out, unseen, worth)
+    return [*steps[:-1], last], reason
 
 
 def _as_shown(model: Model, last: Step) -> Model:

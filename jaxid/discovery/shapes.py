@@ -17,6 +17,7 @@ from .fits import Fits
 from .likelihood import score_of, weights
 from .models import Model
 from .release import doubtful
+from .text import joined
 
 # Other start values of a shape relative to its value, and of the form of a sign.
 _SHARES, _FORMS = (1.0, 0.5), (0.0, 1.0)
@@ -38,6 +39,10 @@ def with_shapes(fits: Fits, at: Model) -> Fit:
     of the minima, weighed by their scores (law of total variance; Madigan and Raftery 1994), and no
     value is less certain than its bounds allow.
 
+    If the score is no better with the shapes free, the recordings do not contradict the held ones,
+    and free values would only follow noise: the values remain, with the deviations of the fit in
+    which the shapes are free.
+
     Only along an imposed motion, where such fits take seconds.
 
     **Returns:** the fit of the model itself if no shape is held, or if no such fit succeeds.
@@ -49,7 +54,11 @@ def with_shapes(fits: Fits, at: Model) -> Fit:
         return at.fit
     found = [fits.with_shapes(at.effects, start, at.noise) for start in _starts(loop, held)]
     sound = [f for f in found if f.status.simulated and f.status is not Status.misfit]
-    return _merged(sound) if sound else at.fit
+    if not sound:
+        return at.fit
+    free = _merged(sound)
+    better = score_of(free).value < score_of(at.fit).value
+    return free if better else _less_certain(at.fit, free, held)
 
 
 def shapes_of(loop: ClosedLoop, added: int) -> list[Parameter]:
@@ -110,6 +119,25 @@ def _merged(found: Sequence[Fit]) -> Fit:
         )
         notes = (*notes, said)
     return dataclasses.replace(best, covariance=covariance, notes=notes)
+
+
+def _less_certain(fit: Fit, free: Fit, held: Sequence[Parameter]) -> Fit:
+    """A fit with held shapes, with the deviations that its values have if the shapes are free.
+
+    **Arguments:**
+
+    - `free`: the fit of the same model with these shapes free.
+    """
+    at = [free.names.index(name) for name in fit.names]
+    apart = free.theta[at] - fit.theta
+    covariance = free.covariance[np.ix_(at, at)] + np.outer(apart, apart)
+    covariance = _between_bounds(covariance, Bounds.of(fit.loop.free_parameters))
+    shapes = joined([f"{p.name} of {float(p.where(fit.loop)):.3g}" for p in held])
+    said = (
+        f"these recordings do not contradict the default {shapes}; the deviations of the other "
+        "values contain its uncertainty"
+    )
+    return dataclasses.replace(fit, covariance=covariance, notes=(*fit.notes, said))
 
 
 def _between_bounds(

@@ -97,7 +97,16 @@ def refuted(
     )
     if held_out is None or reason:
         return reason
-    before, after = held_out
+    return refuted_unseen(chosen, noise, *held_out, worth)
+
+
+def refuted_unseen(
+    chosen: Fit, noise: Sequence[ARFilter], before: Comparison, after: Comparison, worth: float
+) -> str:
+    """The first test on held-out recordings that a model fails, as a reason.
+
+    **Arguments:** as for `refuted`; `before` is the starting model, and `after` the chosen one.
+    """
     return (
         risen(before, after, noise, worth)
         or _above_noise(chosen, after, noise, worth)

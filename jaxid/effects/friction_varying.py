@@ -140,6 +140,16 @@ class ThermalDrift(AbstractEffect):
         return on_joint(self.joint, friction * jnp.exp(-motion.t / self.time_constant), motion)
 
 
+def _bends_visibly(scene: Scene, joint: int, slide: float) -> bool:
+    """Whether a joint moves less than a presliding distance within a sample after a reversal.
+
+    Otherwise friction with memory is a sharp sign of velocity. The acceleration at the reversal is
+    that of a sine over the travel with the highest speed.
+    """
+    acceleration = 2 * float(scene.speed[joint - 1]) ** 2 / max(scene.travel(joint), 1e-300)
+    return slide > acceleration * scene.period**2 / 2
+
+
 class Hysteresis(AbstractEffect):
     """Presliding friction after Dahl 1968: Fh z, with z' = (v - |v| z) / slide."""
 
@@ -158,6 +168,10 @@ class Hysteresis(AbstractEffect):
             for j in scene.joints
             for share in np.geomspace(0.002, 0.06, 5)
         ]
+
+    def genuine(self, scene: Scene, beside: Sequence[AbstractEffect]) -> bool:
+        """Whether the bristle bends for longer than a sample."""
+        return _bends_visibly(scene, self.joint, float(self.slide))
 
     def initial_state(self) -> Float[Array, " states"]:
         """The bristle unloaded, `(1,)`."""
@@ -204,6 +218,10 @@ class LuGre(AbstractEffect):
             for j in scene.joints
             for share in np.geomspace(0.004, 0.03, 3)
         ]
+
+    def genuine(self, scene: Scene, beside: Sequence[AbstractEffect]) -> bool:
+        """Whether the bristle bends for longer than a sample."""
+        return _bends_visibly(scene, self.joint, float(self.slide))
 
     def initial_state(self) -> Float[Array, " states"]:
         """The bristle unloaded, `(1,)`."""
