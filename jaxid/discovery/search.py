@@ -7,6 +7,7 @@ from itertools import islice
 import numpy as np
 
 from ..errors import FitError, ModelError
+from ..estimate import Fit
 from ..noise import ARFilter
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
@@ -49,6 +50,8 @@ class Search(Started):
     without_support: frozenset[tuple] = frozenset()
     # Those of which a fit determines no value of an effect, or finds values of another effect.
     loose: frozenset[tuple] = frozenset()
+    # The model before the last release, its linear system, and the sets that were predicted there.
+    unreleased: tuple[Model, tuple[Fit, Predictor], Sequence[Candidate], float] | None = None
 
     def run(self, loop: ClosedLoop) -> tuple[Outcome, bool]:
         """Predicts and verifies in rounds, until no model has a lower score.
@@ -63,7 +66,9 @@ class Search(Started):
             return "undetermined", False
         while True:
             candidates, nothing = self._predicted(at)
-            better = self._released(at, candidates, nothing)
+            better = self._instead_of_release(at, candidates, nothing)
+            if better is None:
+                better = self._released(at, candidates, nothing)
             if better is None:
                 better = self._verified(at, candidates, nothing)
             if better is None and (better := self._without_one(at)) is not None:
@@ -130,7 +135,41 @@ class Search(Started):
                 break
             assert found.fit is not None
             predictor = Predictor.of(System.of(found.fit), noise, predictor.data.level)
-        return None if found is at else found
+        if found is at:
+            return None
+        self.unreleased = (at, self.seen, candidates, nothing) if along else None
+        return found
+
+    def _instead_of_release(
+        self, at: Model, candidates: Sequence[Candidate], nothing: float
+    ) -> Model | None:
+        """The fit of a set of effects that the last release hides, if it is better.
+
+        Free values of a sign can absorb most of a friction that the model lacks. The friction then
+        explains little beside them, although it explains more in their place. Along an imposed
+        motion, where values are released before effects are added, the set is therefore fitted to
+        the model before the release if it was predicted to be better there than it is now.
+        """
+        had, self.unreleased = self.unreleased, None
+        if had is None:
+            return None
+        before, seen, sets, unchanged = had
+        plain = [c for c in sets if c.effects and c.curve is None and c.score < unchanged]
+
+        def hidden(c: Candidate) -> bool:
+            parts = [x for x in candidates if x.curve is None and Counter(x.key) <= Counter(c.key)]
+            instead = before.score - (unchanged - c.score)
+            return instead < at.score - (nothing - min(x.score for x in parts)) - DECISIVE
+
+        best = next((c for c in sorted(plain, key=lambda c: c.score) if hidden(c)), None)
+        if best is None:
+            return None
+        now, self.seen = self.seen, seen
+        found = None
+        if self._supported(best):
+            found = self._fitted(before, best, plain, unchanged - best.score)
+        self.seen = now
+        return found if found is not None and found.score < at.score - DECISIVE else None
 
     def _release(
         self, at: Model, predictor: Predictor, noise: Sequence[ARFilter], effect: float
