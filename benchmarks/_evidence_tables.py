@@ -49,6 +49,7 @@ def counts(lines: Sequence[Line]) -> dict[str, Count]:
         "effects named": (sum(named), len(named)),
         "whole set, nothing else": count(effects, lambda m: m["right"] and not m["extra"]),
         "clean: left alone": count(of["clean"], lambda m: m["right"]),
+        "clean: nothing wrong added": count(of["clean"], lambda m: not m["alarm"]),
         "outside: no wrong name taken for it": count(of["outside"], lambda m: m["right"]),
         "outside: recognised": count(of["outside"], lambda m: m["recognised"]),
     }
