@@ -8,6 +8,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from ._world_departures import describing
+
 Line = dict[str, Any]
 Count = tuple[int, int]
 # Tools that do not name effects.
@@ -147,14 +149,16 @@ def _grouped(lines: Sequence[Line], key: Callable[[Line], str]) -> pd.DataFrame:
 def calibration(lines: Iterable[Line]) -> pd.DataFrame:
     """Share of added effects that were hidden, by their probability.
 
-    An effect also counts as in its group if one that shares the weight with it was hidden.
+    An effect also counts as in its group if one that shares the weight with it was hidden. Effects
+    that describe the world beside the hidden ones are left out.
     """
     claims: list[tuple[float, bool, bool]] = []
     for line in lines:
         true = _true(line)
         for added in line.get("story", {}).get("added", ()):
-            if added["probability"] is not None:
-                keys = _group(added)
+            keys = _group(added)
+            beside = keys[0][0] in describing(line["world"], line["law"])
+            if added["probability"] is not None and (any(k in true for k in keys) or not beside):
                 claims.append((added["probability"], keys[0] in true, any(k in true for k in keys)))
     rows = {}
     for low, high in pairwise(CLAIMS):

@@ -24,6 +24,8 @@ DESCRIBING: dict[str, tuple[str, ...]] = {
     "delay": ("time_delay", "actuator_lag"),
     "resonance": ("joint_elasticity",),
 }
+# Effects of a drive that a sampled law has if it is taken for continuous.
+DELAYS = "actuator_lag", "time_delay"
 RATES = (50, 100, 200, 250, 500, 1000)
 
 
@@ -140,6 +142,11 @@ class World:
     beside: tuple[Beside, ...] = ()
     delay: int = 0
     uneven: bool = False
+
+
+def describing(world: str, law: str) -> set[str]:
+    """Effects that are neither right nor wrong in a world if the law is known in this way."""
+    return {*DESCRIBING.get(world, ()), *(DELAYS if law == "continuous" else ())}
 
 
 def draw_world(

@@ -42,7 +42,7 @@ from ._world_cases import (
     start_model,
     unexplained,
 )
-from ._world_departures import DESCRIBING, WORLDS
+from ._world_departures import WORLDS, describing
 from ._world_physics import EFFECTS, FRICTIONS, LARGER, OUTSIDE, ROBOTS
 from ._world_results import append, line_of, origin
 from .hidden_effects import configure_jax, floor_percent
@@ -85,10 +85,6 @@ def _solve(wanted: Wanted) -> dict[str, Any]:
     }
 
 
-# Effects of a drive that a sampled law has if it is taken for continuous.
-DELAYS = "actuator_lag", "time_delay"
-
-
 def judge(case: Case, wanted: Wanted, story: dict[str, Any], floor: np.ndarray) -> dict[str, Any]:
     """The marks of a story.
 
@@ -98,7 +94,7 @@ def judge(case: Case, wanted: Wanted, story: dict[str, Any], floor: np.ndarray) 
     """
     kind, law = wanted.kind, wanted.law
     true = [(e.name, e.joint + 1) for e in case.hidden]
-    beside = {*DESCRIBING.get(wanted.world, ()), *(DELAYS if law == "continuous" else ())}
+    beside = describing(wanted.world, law)
     named = [
         (a, [(e["effect"], e["joint"]) for e in (a, *a["indistinguishable"])])
         for a in story["added"]

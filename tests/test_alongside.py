@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from independent import effects as fx
 from loops import four_joints, scara
-from stories import recordings_of, silent
+from stories import recordings_of, search_of, silent
 
 import jaxid
 from jaxid import Stepping
@@ -188,6 +188,28 @@ def test_what_another_effect_leaves_is_no_sampled_law():
     demo = Path(jaxid.__file__).parent / "demo" / "hidden"
     recordings = jaxid.Recordings.of(jaxid.read(demo / "fit_1.csv", demo / "fit_2.csv"))
     assert late(recordings, [Stribeck]) == ()
+
+
+@pytest.mark.parametrize(
+    ("controller", "late"), [(sim.SampledPD(period=0.01), True), (sim.PD(), False)]
+)
+def test_drives_are_late_beside_an_added_effect(controller, late):
+    """The delay of one drive is part of the model, as that of the other one may be hidden."""
+    case = sim.make_case(5, duration=8.0, effects=[OFFSET], controller=controller)
+    search = search_of(case)
+    search.asked = dataclasses.replace(search.asked, catalogue=(TorqueOffset,))
+    search.given = jaxid.scara()
+    start = jaxid.fit(search.given, recordings_of(case)[0])
+    search.visit((), start)
+    offset, delay = TorqueOffset(joint=1), TimeDelay(joint=1, delay=1e-3)
+    both = jaxid.fit(start.loop.add(offset, delay), recordings_of(case)[0])
+    at = search.visit(search.added(both), both)
+    assert ("like a law that is sampled" in search._late_beside(at)) == late
+    # What was already tested, and laws that are not simulated, are not tested again.
+    for known in (at.effects[:1], at.effects[1:]):
+        assert search._late_beside(dataclasses.replace(at, effects=known)) == ""
+    search.given = along_recorded(jaxid.serial(four_joints(), LAW))
+    assert search._late_beside(at) == ""
 
 
 def delays(**case) -> tuple[float, ...]:

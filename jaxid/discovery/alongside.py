@@ -30,8 +30,10 @@ _SURE, _ALIKE = 3.0, 2.0
 # Number of effects beside a late drive that must not be needed without the law. One may be missed
 # there, because a part of it is above the cutoff.
 _FEWER = 2
+# Delays of a drive.
+DELAYS = (TimeDelay, ActuatorLag)
 # Effects that are the same as the delay of a drive, or approximate it.
-_LAGS = (TimeDelay, ActuatorLag, AbstractTransmission)
+_LAGS = (*DELAYS, AbstractTransmission)
 # Steps between two grid points up to which a simulation is fast enough.
 _STEPS = 16
 
@@ -101,7 +103,7 @@ def one_late_drive(
 
     **Returns:** the reason, and the largest number of effects without the law that confirms it.
     """
-    others = [e for e in effects if not isinstance(e, TimeDelay | ActuatorLag)]
+    others = [e for e in effects if not isinstance(e, DELAYS)]
     most = len(others) - _FEWER
     if given.joints > 1 or most < 0:
         return "", 0
@@ -112,11 +114,11 @@ def _late(given: ClosedLoop, effects: Sequence[AbstractEffect], period: float) -
     """Delays of the drives, s, by added effects, if all drives are late by about the same time."""
     late: dict[int, float] = {}
     for effect in effects:
-        if isinstance(effect, TimeDelay | ActuatorLag):
+        if isinstance(effect, DELAYS):
             delay = effect.delay if isinstance(effect, TimeDelay) else effect.time_constant
             late[effect.joint] = late.get(effect.joint, 0.0) + float(delay)
     times = tuple(late.values())
-    if not _simulated_continuously(given) or len(times) < given.joints:
+    if not simulated_continuously(given) or len(times) < given.joints:
         return ()
     return times if max(times) < min(_ALIKE * min(times), LATE * period) else ()
 
@@ -153,7 +155,7 @@ def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, .
     **Arguments:** those of `sampled`.
     """
     loop, period = screened.system.loop, diagnosis.fit.recordings.common_period()
-    if not _simulated_continuously(loop) or loop.joints == 1:
+    if not simulated_continuously(loop) or loop.joints == 1:
         return ()
     data = dataclasses.replace(screened.data, level=diagnosis.data.level)
     predictor = Predictor.of(screened.system, diagnosis.noise, data.level)
@@ -177,7 +179,7 @@ def delays_of_drives(diagnosis: Diagnosis, screened: Screened) -> tuple[float, .
     return tuple(found.tolist()) if sure else ()
 
 
-def _simulated_continuously(loop: ClosedLoop) -> bool:
+def simulated_continuously(loop: ClosedLoop) -> bool:
     """Whether a law that is declared as continuous is simulated, and torque is compared."""
     law = loop.controller
     return law.period is None and not law.imposes and law.judged == "torque"

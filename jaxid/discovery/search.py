@@ -155,13 +155,7 @@ class Search(Started):
             return None
         before, seen, sets, unchanged = had
         plain = [c for c in sets if c.effects and c.curve is None and c.score < unchanged]
-
-        def hidden(c: Candidate) -> bool:
-            parts = [x for x in candidates if x.curve is None and Counter(x.key) <= Counter(c.key)]
-            instead = before.score - (unchanged - c.score)
-            return instead < at.score - (nothing - min(x.score for x in parts)) - DECISIVE
-
-        best = next((c for c in sorted(plain, key=lambda c: c.score) if hidden(c)), None)
+        best = _hidden(plain, before.score - unchanged, candidates, at.score - nothing)
         if best is None:
             return None
         now, self.seen = self.seen, seen
@@ -372,6 +366,27 @@ class Search(Started):
         better = [c for c in sets if c.effects and c.score < nothing - LIKELY]
         unfinished = unfinished and any(map(self._supported, better[:_EXAMINED]))
         return ("explained" if self.at.effects else "adequate"), unfinished
+
+
+def _hidden(
+    instead: Sequence[Candidate],
+    had: float,
+    beside: Sequence[Candidate],
+    now: float,
+) -> Candidate | None:
+    """The best set that is predicted to be better in the place of released values than beside them.
+
+    **Arguments:**
+
+    - `instead`: sets of effects in the model before the release. `beside`: those after it.
+    - `had`, `now`: differences between scores of fits and of predictions, before and after it.
+    """
+    for c in sorted(instead, key=lambda c: c.score):
+        key = Counter(c.key)
+        parts = [x.score for x in beside if x.curve is None and Counter(x.key) <= key]
+        if had + c.score < now + min(parts) - DECISIVE:
+            return c
+    return None
 
 
 def _lost(model: Model, at: Model) -> bool:

@@ -7,7 +7,14 @@ from ..effects import AbstractEffect
 from ..estimate import Fit
 from ..estimate.mistakes import doubtful_law
 from ..simulation.loop import ClosedLoop
-from .alongside import late_drives, sampled, slow_or_wrong, without_law
+from .alongside import (
+    DELAYS,
+    late_drives,
+    sampled,
+    simulated_continuously,
+    slow_or_wrong,
+    without_law,
+)
 from .diagnosis import Diagnosis
 from .examined import Examined
 from .explore import key_of
@@ -73,6 +80,7 @@ class Started(Examined):
         assert start is not None
         assert start.fit is not None
         why = late_drives(self.given, at.effects, self.asked.recordings.common_period())
+        why = why or self._late_beside(at)
         first = self._along(start.fit, why)
         if first is start.fit:
             return None
@@ -81,6 +89,24 @@ class Started(Examined):
         self.forget()
         self.note(self.why)
         return self.visit((), fit)
+
+    def _late_beside(self, at: Model) -> str:
+        """Why the law seems to be sampled beside the added effects; empty if it does not.
+
+        A missing effect can hide that all drives are late. The search then adds the delay of one
+        drive with the effect, and further effects for what the other drives lack. So the delays are
+        estimated again beside the added effects, without those of a drive.
+        """
+        others = tuple(e for e in at.effects if not isinstance(e, DELAYS))
+        known = len(others) in (0, len(at.effects))
+        if known or self.given.joints == 1 or not simulated_continuously(self.given):
+            return ""
+        less = self.had(at, others) or self.refitted(at, others)
+        assert less.fit is not None
+        if not less.fit.status.simulated:
+            return ""
+        screened, diagnosis = self.screened(less.fit, others)
+        return sampled(diagnosis, screened)
 
     def _along(self, first: Fit, why: str) -> Fit:
         """The fit of the starting model along the recorded motion if there is a reason for it."""
