@@ -32,7 +32,7 @@ from ._baseline_rows import Motion, Table, residual, table_of
 from ._baseline_tools import TOOLS, Found
 from ._evidence_tables import by_tool
 from ._world_cases import Case, Wanted, draw_wanted, make, read_case, start_model, unexplained
-from ._world_departures import WORLDS
+from ._world_departures import WORLDS, describing
 from ._world_physics import LARGER, ROBOTS
 from ._world_results import append, origin
 from .hidden_effects import configure_jax, floor_percent
@@ -96,28 +96,30 @@ def _asked(
     after = floor_percent(loop, errors, held_out)
     added = [{"effect": effect, "joint": joint} for effect, joint in found.named]
     story = {"added": added, "error_percent": {"after": {"validate": after.tolist()}}, "cpu": cpu}
-    return {"story": story, "marks": judge(case, wanted.kind, found)}
+    return {"story": story, "marks": judge(case, wanted, found)}
 
 
 def _after(answer: dict[str, Any]) -> list[float]:
     return answer["story"]["error_percent"]["after"]["validate"]
 
 
-def judge(case: Case, kind: str, found: Found) -> dict[str, Any]:
+def judge(case: Case, wanted: Wanted, found: Found) -> dict[str, Any]:
     """The marks of a tool's answer.
 
-    For a clean arm the right answer is that nothing is missing. For an effect outside the catalogue
-    it is right to name no effect; the effect is recognised if the tool also reports that something
-    is missing.
+    For a clean arm the right answer is that nothing is missing, or nothing but effects that
+    describe the world. For an effect outside the catalogue it is right to name no other effect; the
+    effect is recognised if the tool also reports that something is missing.
     """
-    marks: dict[str, Any] = {"missing": found.missing}
-    if kind == "clean":
-        return {**marks, "right": not found.missing, "alarm": found.missing}
-    if kind == "outside":
-        nothing = not found.named
-        return {**marks, "right": nothing, "recognised": nothing and found.missing}
     true: list[Key] = [(e.name, e.joint + 1) for e in case.hidden]
-    marks |= names_right([[key] for key in found.named], true)
+    beside = describing(wanted.world, LAW)
+    named = [key for key in found.named if key in true or key[0] not in beside]
+    marks: dict[str, Any] = {"missing": found.missing}
+    if wanted.kind == "clean":
+        alarm = found.missing and (bool(named) or not found.named)
+        return {**marks, "right": not alarm, "alarm": alarm}
+    if wanted.kind == "outside":
+        return {**marks, "right": not named, "recognised": not named and found.missing}
+    marks |= names_right([[key] for key in named], true)
     return {**marks, "right": all(marks["named"])}
 
 

@@ -1,6 +1,7 @@
 """The worlds of the benchmark: what is simulated, logged and marked."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -127,6 +128,30 @@ def test_a_world_acts_in_the_recordings(world, tmp_path):
     story["added"] = story["added"][:-1]
     assert not judge(case, wanted, story, np.ones(1))["alarm"]
     assert judge(case, wanted, story, np.ones(1))["right"]
+
+
+def test_an_effect_that_describes_the_world_is_no_alarm_of_another_tool():
+    for module in ("mujoco", "pinocchio", "pysindy", "gplearn", "sklearn"):
+        pytest.importorskip(module)
+    if not (ROOT / "benchmarks").is_dir():
+        pytest.skip("no benchmarks beside the tests: they are part of a checkout alone")
+    from benchmarks import baselines
+    from benchmarks._baseline_tools import Found
+
+    kind = "clean", 5, (), "axis", "tanh", "white", "unknown", None, "peak"
+    wanted, case = baselines.Wanted(0, *kind), SimpleNamespace(hidden=())
+
+    def alarm(missing: bool, *named: str) -> bool:
+        found = Found(tuple((name, 1) for name in named), missing, lambda _: np.zeros(1))
+        marks = baselines.judge(case, wanted, found)
+        assert marks["right"] != marks["alarm"]
+        return marks["alarm"]
+
+    assert not alarm(False)
+    assert not alarm(True, "stribeck")
+    assert alarm(True, "stribeck", "spring")
+    # A tool without names only says that something is missing.
+    assert alarm(True)
 
 
 def test_a_world_whose_effect_does_not_act_is_drawn_again():
