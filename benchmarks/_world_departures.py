@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ._world_physics import Friction, Robot
+from ._world_physics import Friction, Hidden, Robot
 
 WORLDS = ("plain", "lugre", "peak", "load_and_heat", "drift", "jitter", "delay", "resonance")
 # Effects of the catalogue that describe a world: there they are true, and no further effect.
@@ -54,29 +54,6 @@ class Bristles:
         rate = (w - abs(w) * self.bend / most) / self.reach
         self.bend += dt * rate
         return self.coulomb * self.bend + self.damping * self.reach * rate
-
-
-@dataclass(frozen=True)
-class Peak:
-    """Friction that is larger at low speed, with any exponent."""
-
-    joint: int
-    friction: Friction
-    size: float
-    velocity: float
-    exponent: float
-
-    def reset(self) -> None:
-        """Nothing to reset: it has no state."""
-
-    def torque(
-        self, t: float, q: Sequence[float], v: Sequence[float], tau: Sequence[float], dt: float
-    ) -> float:
-        """The torque in addition to the Coulomb friction."""
-        w = v[self.joint]
-        return (
-            self.size * math.exp(-(abs(w / self.velocity) ** self.exponent)) * self.friction.edge(w)
-        )
 
 
 @dataclass(frozen=True)
@@ -128,7 +105,7 @@ class Resonance:
         return self.inertia * pull
 
 
-Beside = Bristles | Peak | LoadAndHeat | Resonance
+Beside = Bristles | Hidden | LoadAndHeat | Resonance
 
 
 @dataclass(frozen=True)
@@ -180,16 +157,14 @@ def draw_world(
             )
         return World(tuple(replace(f, coulomb=0.0) for f in frictions), tuple(found))
     if name == "peak":
-        peaks = (
-            Peak(
-                j,
-                frictions[j],
-                frictions[j].coulomb * uniform(0.2, 0.8),
-                speeds[j] * uniform(0.02, 0.1),
-                uniform(0.6, 3.0),
+        peaks = []
+        for j, friction in zip(joints, frictions, strict=True):
+            size = friction.coulomb * uniform(0.2, 0.8)
+            drawn = {"velocity": uniform(0.02, 0.1), "exponent": uniform(0.6, 3.0)}
+            link = robot.links[j]
+            peaks.append(
+                Hidden("stribeck", j, friction, link.travel, speeds[j], drawn, link.slides, size)
             )
-            for j in joints
-        )
         return World(frictions, tuple(peaks))
     if name == "load_and_heat":
         both = (

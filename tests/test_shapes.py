@@ -36,17 +36,25 @@ def falling(v):
     return np.tanh(v / WIDTH) * (1 + PEAK / DRY * np.exp(-np.abs(v / SPEED)))
 
 
-@pytest.fixture(scope="module")
-def ended():
-    """A fitted model whose exponent is held at 2, where 1 is true, and what made its fit."""
+def fitted(sign):
+    """A fitted model of an axis with a peak whose exponent is held at 2, and what made its fit.
+
+    `sign`: the true sign of velocity, with its peak.
+    """
     width = WIDTH * np.arctanh(0.5)
     peak = Stribeck(1, 1.0, 0.03, smoothing=width, form=1.0)
     friction = Coulomb(1, 3.0, smoothing=width, form=1.0)
     loop = axis().without("coulomb").add(friction, peak)
-    refits = Refits(jaxid.Recordings.of([recorded(k, falling) for k in (1, 2)]), jaxid.OEM())
+    refits = Refits(jaxid.Recordings.of([recorded(k, sign) for k in (1, 2)]), jaxid.OEM())
     noise = (ARFilter(np.zeros(0), 1e-3),)
     fit = refits.filtered(loop, noise)
     return refits, Model((fit.loop.effects[-1],), 0.0, fit=fit, noise=noise)
+
+
+@pytest.fixture(scope="module")
+def ended():
+    """A fitted model whose exponent is held at 2, where 1 is true."""
+    return fitted(falling)
 
 
 def test_an_exponent_is_estimated_at_the_end(ended):
@@ -66,15 +74,8 @@ def bell(v):
 
 def test_a_shape_that_the_recordings_do_not_contradict_stays_and_makes_values_less_certain():
     """The values of the fit with a free shape would only follow the noise."""
-    width = WIDTH * np.arctanh(0.5)
-    peak = Stribeck(1, 1.0, 0.03, smoothing=width, form=1.0)
-    friction = Coulomb(1, 3.0, smoothing=width, form=1.0)
-    loop = axis().without("coulomb").add(friction, peak)
-    refits = Refits(jaxid.Recordings.of([recorded(k, bell) for k in (1, 2)]), jaxid.OEM())
-    noise = (ARFilter(np.zeros(0), 1e-3),)
-    held = refits.filtered(loop, noise)
-    model = Model((held.loop.effects[-1],), 0.0, fit=held, noise=noise)
-    found = with_shapes(Fits(refits, Campaign(None, {})), model)
+    refits, model = fitted(bell)
+    held, found = model.fit, with_shapes(Fits(refits, Campaign(None, {})), model)
     np.testing.assert_array_equal(found.theta, held.theta)
     assert "ds1" not in found.names
     assert np.all(found.std >= held.std * (1 - 1e-9))

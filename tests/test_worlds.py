@@ -46,7 +46,7 @@ def test_parts_of_worlds_have_the_torque_of_their_closed_forms():
     if not (ROOT / "benchmarks").is_dir():
         pytest.skip("no benchmarks beside the tests: they are part of a checkout alone")
     from benchmarks import _world_departures as departures
-    from benchmarks._world_physics import Friction
+    from benchmarks._world_physics import Friction, draw_robot
 
     # Sliding bristles have the force of Armstrong-Hélouvry's curve, and begin as a spring.
     bristles = departures.Bristles(0, 2.0, 0.001, 0.0, 0.5, 0.05)
@@ -54,8 +54,12 @@ def test_parts_of_worlds_have_the_torque_of_their_closed_forms():
     assert torques[-1] == pytest.approx(2.0 * (1 + 0.5 * np.exp(-((0.04 / 0.05) ** 2))), rel=1e-6)
     assert torques[0] == pytest.approx(2.0 * 0.04 * 1e-4 / 0.001, rel=0.01)
     friction = Friction(0.1, 2.0, "tanh", 1e-3)
-    peak = departures.Peak(0, friction, 0.8, 0.05, 0.6)
-    assert _moved(peak, lambda _: 0.04, 0.01)[-1] == pytest.approx(0.8 * np.exp(-(0.8**0.6)))
+    rng = np.random.default_rng(3)
+    one, robot = np.ones(1), draw_robot(rng, "axis")
+    (peak,) = departures.draw_world(rng, "peak", robot, (friction,), one, one, one, 9.0).beside
+    fall = np.exp(-((0.04 / peak.drawn["velocity"]) ** peak.drawn["exponent"]))
+    assert _moved(peak, lambda _: 0.04, 0.01)[-1] == pytest.approx(peak.size * fall)
+    assert 0.2 <= peak.size / friction.coulomb <= 0.8
     # Load and temperature multiply: 20 % by twice the load, -10 % after ten time constants.
     both = departures.LoadAndHeat(0, friction, 3.0, 0.1, -0.1, 0.05)
     torques = _moved(both, lambda _: 0.04, 0.5, tau=-6.0)
