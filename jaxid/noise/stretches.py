@@ -55,22 +55,33 @@ def through(
     taps, reach = taps.astype(x.dtype), taps.shape[1] - 1
     if reach == 0:
         return np.where(depth[:, None] >= 0, taps[0] * x, 0)
+    out = np.zeros_like(x)
     # Of a band as wide as it is high half is zeros; a lower one would be too many products.
-    size, out = max(_ROWS, reach), np.empty_like(x)
-    usual = _band(taps, np.full(size, reach))
+    size = max(_ROWS, reach)
+    whole = _band(np.broadcast_to(taps[-1], (size, reach + 1)))
     for at in range(0, len(x), size):
-        own = depth[at : at + size]
-        band = usual[: len(own)] if np.all(own >= reach) else _band(taps, own)
-        first = max(at - reach, 0)
-        out[at : at + size] = band[:, first - at + reach : len(own) + reach] @ x[first : at + size]
+        own = depth[at : at + size] >= reach
+        if own.any():
+            first = max(at - reach, 0)
+            band = whole[: len(own), first - at + reach : len(own) + reach]
+            out[at : at + size] = (band @ x[first : at + size]) * own[:, None]
+    # The first samples of a stretch are predicted from those before them in it.
+    early = _band(taps[:reach])[:, reach:]
+    for first in np.flatnonzero(depth == 0):
+        left = min(reach, len(x) - first)
+        count = int(np.sum(depth[first : first + left] == np.arange(left)))
+        out[first : first + count] = early[:count, :count] @ x[first : first + count]
     return out
 
 
-def _band(
-    taps: Float[np.ndarray, "depths lags"], depth: Int[np.ndarray, " rows"]
-) -> Float[np.ndarray, "rows columns"]:
-    """The matrix from some rows and as many rows before them as the order to the predictions."""
-    reach = taps.shape[1] - 1
-    lag = np.arange(len(depth))[:, None] + reach - np.arange(len(depth) + reach)
-    chosen = taps[np.clip(depth, 0, reach)[:, None], np.clip(lag, 0, reach)]
-    return np.where((depth[:, None] >= 0) & (lag >= 0) & (lag <= reach), chosen, 0)
+def _band(taps: Float[np.ndarray, "rows lags"]) -> Float[np.ndarray, "rows columns"]:
+    """The matrix from some rows, and as many before them as the order, to the predictions.
+
+    **Arguments:**
+
+    - `taps`: coefficients of each row's prediction, from its own sample backward.
+    """
+    rows, reach = len(taps), taps.shape[1] - 1
+    lag = np.arange(rows)[:, None] + reach - np.arange(rows + reach)
+    chosen = taps[np.arange(rows)[:, None], np.clip(lag, 0, reach)]
+    return np.where((lag >= 0) & (lag <= reach), chosen, 0)
