@@ -1,6 +1,8 @@
 """Output error on a robot that jaxid did not simulate: truth, deviations, and failing fits."""
 
 import dataclasses
+import subprocess
+import sys
 from typing import Literal
 
 import independent as sim
@@ -230,6 +232,36 @@ def test_what_cannot_be_fitted_is_refused_with_what_to_do(cases, change, method,
     loop = dataclasses.replace(jaxid.scara(), **change)
     with pytest.raises(error, match=says):
         jaxid.fit(loop, both(cases[0])[0], method)
+
+
+OF_ANOTHER_KIND = """
+import numpy as np, jaxid
+t = np.linspace(0, 1, 50)
+recording = jaxid.Recording.from_arrays(t, np.sin(t), np.cos(t), name="run")
+loop = jaxid.emps()
+for wrong in (
+    lambda: jaxid.fit(recording, loop),
+    lambda: jaxid.discover([recording], loop),
+    lambda: loop.add("spring"),
+    lambda: jaxid.fit(loop, "run_1.csv"),
+):
+    try:
+        wrong()
+    except jaxid.errors.JaxidError as error:
+        print(type(error).__name__, error)
+"""
+
+
+def test_arguments_of_another_kind_are_refused_with_what_to_do():
+    # Without the checks of types that the tests install.
+    found = subprocess.run(
+        [sys.executable, "-c", OF_ANOTHER_KIND], capture_output=True, text=True, check=True
+    )
+    one, other, effect, path = found.stdout.splitlines()
+    assert one.startswith("ModelError the first argument is a Recording, not a loop: give")
+    assert other.startswith("ModelError the first argument is a list, not a loop: give")
+    assert effect.startswith("ModelError 'spring' is not an effect of emps: give an object")
+    assert path == "RecordingError Recordings: 'run_1.csv' is not a Recording; use jaxid.read first."
 
 
 def test_regressions_say_what_they_cannot_see(cases):

@@ -37,7 +37,7 @@ MISTAKES = {
         "torque of joint 2 seems to have the wrong sign",
     ),
     "all signs": (lambda r: {"tau": -r.tau}, "torque of all joints seems to have the wrong sign"),
-    "swapped": (lambda r: {"tau": r.tau[:, ::-1]}, "torques of joints 1 and 2"),
+    "swapped": (lambda r: {"tau": r.tau[:, ::-1]}, r"torques \(or positions\) of joints 1 and 2"),
     "degrees": (
         lambda r: {"q": np.rad2deg(r.q)},
         "position of all joints seems to be in degrees, not",

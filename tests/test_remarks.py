@@ -31,8 +31,10 @@ def notes(fit, given=None, **values):
 @pytest.mark.parametrize(
     ("delay", "said", "unusual"),
     [
-        (0.0005, "act 0.5 ± 0.01 ms later than recorded, as if it is held", False),
-        # Three samples of 4 ms.
+        (0.0005, "act 0.5 ± 0.01 ms later than recorded, which a sampled law, a bus or", False),
+        # Half a sample of 4 ms, one and a half samples, three samples.
+        (0.002, "act 2 ± 0.01 ms later than recorded, as if it is held", False),
+        (0.006, "act 6 ± 0.01 ms later than recorded, which a sampled law, a bus or", False),
         (0.012, "act 12 ± 0.01 ms later than recorded, which a sampled law does not", True),
         (-0.001, "act 1 ± 0.01 ms earlier than recorded, which a sampled law does not", True),
     ],

@@ -11,7 +11,7 @@ from test_release import DRY, axis, recorded
 import jaxid
 from jaxid.discovery.asked import Asked
 from jaxid.discovery.fits import Fits
-from jaxid.discovery.last_tries import replaced
+from jaxid.discovery.last_tries import replaced, with_free_shape
 from jaxid.discovery.models import Model
 from jaxid.discovery.search import Search
 from jaxid.discovery.shapes import (
@@ -128,19 +128,52 @@ def test_deviations_contain_the_distance_between_minima(ended):
     assert found.notes == one.notes
 
 
-def test_a_rival_whose_shape_is_held_is_fitted_with_the_shape_free(ended):
-    """Drag in the place of the peak, which with its exponent held has a score that is worse by 20.
+def searched(refits, peak):
+    """A search that has fitted the axis without and with its peak, the bare loop, and the latter.
 
-    The score of the drag is made up; the fits are not.
+    `refits`, `peak`: as returned by `fitted`.
     """
-    refits, peak = ended
     asked = Asked(refits.recordings, None, jaxid.OEM(), jaxid.catalogue, 0.01, 0.05, 6)
     search = Search(asked, Campaign(None, {}), silent)
     bare = dataclasses.replace(
         peak.fit.loop.with_effects(peak.fit.loop.effects[:-1]), held=peak.fit.loop.held
     )
     search.visit((), refits.filtered(bare, peak.noise))
-    held = search.visit(search.added(peak.fit), peak.fit)
+    return search, bare, search.visit(search.added(peak.fit), peak.fit)
+
+
+def test_an_effect_that_corrects_a_held_shape_is_compared_with_the_shape_free(ended):
+    """Drag beside the peak, whose exponent is held at 2; without the drag the exponent is free."""
+    refits, peak = ended
+    search, _, held = searched(refits, peak)
+    both = refits.filtered(peak.fit.loop.add(QuadraticDrag(1)), peak.noise)
+    at = search.visit(search.added(both), both)
+    assert at.score < held.score - 20
+    found = with_free_shape(search, at)
+    assert found is not None
+    assert found.names == (("stribeck", 1),)
+    assert "ds1" in found.fit.loop.names
+    assert found.score < at.score - 20
+    # Nothing else has a held shape, so the result is final.
+    assert with_free_shape(search, found) is None
+
+
+def test_a_true_effect_stays_beside_a_free_shape():
+    """Without the drag, which is true, the free exponent explains less."""
+    refits, peak = fitted(lambda v: bell(v) + 0.3 * v * np.abs(v))
+    search, _, _ = searched(refits, peak)
+    both = refits.filtered(peak.fit.loop.add(QuadraticDrag(1)), peak.noise)
+    at = search.visit(search.added(both), both)
+    assert with_free_shape(search, at) is None
+
+
+def test_a_rival_whose_shape_is_held_is_fitted_with_the_shape_free(ended):
+    """Drag in the place of the peak, which with its exponent held has a score that is worse by 20.
+
+    The score of the drag is made up; the fits are not.
+    """
+    refits, peak = ended
+    search, bare, held = searched(refits, peak)
     assert has_held_shape(held.effects[0])
     dragged = refits.filtered(bare.add(QuadraticDrag(1)), peak.noise)
     drag = search.judged(search.added(dragged), dragged)

@@ -11,7 +11,9 @@ import pytest
 import jaxid
 from jaxid.arms import BODY, SerialArm
 from jaxid.chain import moved_body
+from jaxid.control import PD, Tracking
 from jaxid.discovery.hypotheses import survey
+from jaxid.discovery.screening import not_examined
 from jaxid.discovery.step import effect_parameters
 from jaxid.effects import (
     BaseTilt,
@@ -179,8 +181,8 @@ def test_a_payload_has_the_parameters_that_motions_show(arm):
 # --- which arm is offered which -----------------------------------------------------------------
 
 
-def proposed(loop, names=("a", "b")):
-    """Classes that the catalogue proposes for a loop along a made-up motion."""
+def scene_along(loop, names=("a", "b")):
+    """The scene of a loop along a made-up motion."""
     rng = np.random.default_rng(0)
     q, v, a = rng.uniform(-1, 1, (3, len(names), 50, loop.joints))
     time = np.tile(np.linspace(0, 1, 50), (len(names), 1))
@@ -191,8 +193,24 @@ def proposed(loop, names=("a", "b")):
     # As a linearised run gives it: points are the first axes.
     labels = np.zeros(time.shape, int)
     motion = jax.vmap(jax.vmap(Motion))(time, q, v, a, q, np.zeros((*time.shape, 0)), labels)
-    scene = survey(loop, jaxid.Recordings.of(made), motion, [()] * loop.joints)
+    return survey(loop, jaxid.Recordings.of(made), motion, [()] * loop.joints)
+
+
+def proposed(loop, names=("a", "b")):
+    """Classes that the catalogue proposes for a loop along a made-up motion."""
+    scene = scene_along(loop, names)
     return {entry: list(entry.screened(scene)) for entry in jaxid.catalogue}
+
+
+def test_what_an_arm_from_a_urdf_cannot_show_without_its_law_is_named():
+    unknown = jaxid.serial(POLAR)
+    names = not_examined(unknown, scene_along(unknown), jaxid.catalogue)
+    assert {"backlash", "joint elasticity", "actuator lag", "torque saturation"} <= set(names)
+    assert "spring" not in names
+    known = jaxid.serial(POLAR, PD(Kp=[100.0, 100.0], Kv=[10.0, 10.0]))
+    flat = jaxid.two_link(Tracking(), link_length=0.5)
+    for loop in (known, flat):
+        assert not not_examined(loop, scene_along(loop), jaxid.catalogue)
 
 
 def test_each_arm_is_offered_the_gravity_and_the_payload_that_are_right_for_it():

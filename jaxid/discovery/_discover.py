@@ -14,6 +14,7 @@ from ..estimate import OEM, Fit, Status
 from ..estimate.standstill import slow_note, worst_at_standstill
 from ..recording import Recording, Recordings
 from ..simulation.batch import prepare
+from ..simulation.checks import check_loop
 from ..simulation.dynamics import imposed
 from ..simulation.loop import ClosedLoop
 from ..simulation.sharing import with_one_blas_thread
@@ -28,6 +29,7 @@ from .landscape import form
 from .models import Model, Named, named, probability, worth_keeping
 from .parts import without_parts
 from .remarks import remarks
+from .screening import not_examined
 from .search import Search
 from .shapes import with_shapes
 from .step import Step
@@ -95,6 +97,7 @@ def discover(
     also fitted; `SaveError` if the folder contains steps of another call.
     """
     started = time.perf_counter()
+    check_loop(loop)
     judged = loop.controller.judged
     if method is not None and method.output not in (None, judged):
         raise FitError(
@@ -235,6 +238,7 @@ def _told(
         models = tuple(_as_shown(m, steps[-1]) if m.fit is search.at.fit else m for m in models)
         steps = _without_probabilities(steps) if reason else steps
     notes = (*remarks(steps, search.given, search.offsets), *search.failures)
+    notes = (*notes, *_not_examined(search))
     notes = (*_without_recordings(search.asked.recordings, steps[0].fit), *notes)
     if unfinished and reason != short:
         notes = (short, *notes)
@@ -330,6 +334,20 @@ def _without_recordings(asked: Recordings, first: Fit) -> list[str]:
     return [
         f"all fits leave out {joined(gone)}, because the simulation of the starting model diverges "
         "there: start from other values, or check the recording"
+    ]
+
+
+def _not_examined(search: Search) -> list[str]:
+    """A note on effects of the catalogue that were not compared with the residual."""
+    diagnosis = next(iter(search.diagnoses.values()), None)
+    if diagnosis is None:
+        return []
+    names = not_examined(diagnosis.fit.loop, diagnosis.scene, search.asked.catalogue)
+    if not names:
+        return []
+    return [
+        f"not examined: {joined(names)}, because without the law the motion of this arm is not "
+        "simulated; with its law, an arm of up to three joints is examined for these as well"
     ]
 
 

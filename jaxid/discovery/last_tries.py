@@ -1,5 +1,6 @@
 """Models that a search tries in full when no addition and no removal is better."""
 
+import dataclasses
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -64,7 +65,9 @@ def replaced(search: Examined, at: Model) -> Model | None:
         if rival.fit is None or _at_another_minimum(search, rival):
             again = partial(search.fits.exchanged, loop, at.effects, rival.effects, rival.noise)
             best = _better(search, best, rival.effects, again)
-        best = _with_free_shapes(search, best, rival.effects) if along else best
+        fitted = search.visited.fitted(rival.effects)
+        if along and fitted is not None and fitted is not best:
+            best = _with_free_shapes(search, best, fitted)
     return None if best is at else best
 
 
@@ -88,11 +91,8 @@ def _at_another_minimum(search: Examined, model: Model) -> bool:
     return bool(search.visited.ranked(is_better))
 
 
-def _with_free_shapes(search: Examined, best: Model, effects: Sequence[AbstractEffect]) -> Model:
+def _with_free_shapes(search: Examined, best: Model, rival: Model) -> Model:
     """The better one of a model and of a fitted rival with the held shapes of its effects free."""
-    rival = search.visited.fitted(effects)
-    if rival is None or rival is best:
-        return best
     assert rival.fit is not None
     loop = rival.fit.loop
     held = shapes_of(loop, len(rival.effects))
@@ -101,6 +101,30 @@ def _with_free_shapes(search: Examined, best: Model, effects: Sequence[AbstractE
     start = loop.free(*[p.name for p in held])
     again = partial(search.fits.with_shapes, rival.effects, start, rival.noise)
     return _better(search, best, rival.effects, again)
+
+
+def with_free_shape(search: Examined, at: Model) -> Model | None:
+    """The best fit without one effect and with held shapes on its joint free; None if the effect is
+    needed beside them.
+
+    An effect may only correct the shape of another one on the joint. Along an imposed motion, where
+    a fit takes seconds, the model with that shape free is fitted. As in a removal, it is preferred
+    unless its score is higher by odds of 20 to 1.
+    """
+    assert at.fit is not None
+    if not imposed(at.fit.loop):
+        return None
+    found = []
+    for gone in at.effects:
+        rest = tuple(e for e in at.effects if e is not gone)
+        joint = getattr(gone, "joint", None)
+        if any(has_held_shape(e) and getattr(e, "joint", None) == joint for e in rest):
+            less = search.had(at, rest) or search.refitted(at, rest)
+            # Its own filters describe a part of the missing effect as noise.
+            less = dataclasses.replace(less, noise=at.noise)
+            found.append(_with_free_shapes(search, less, less))
+    best = min(found, key=lambda m: m.score, default=at)
+    return best if best is not at and best.score < at.score + LIKELY else None
 
 
 def doubtful(search: Examined, at: Model) -> Model | None:
@@ -224,3 +248,7 @@ def _better(
     if not fit.status.simulated or search.not_genuine(fit):
         return best
     return min(best, search.visit(search.added(fit), fit), key=lambda m: m.score)
+
+
+# In the order in which they are tried.
+ATTEMPTS = replaced, with_free_shape, with_transmission, without_offset, doubtful

@@ -13,12 +13,16 @@ from .models import Model, listed
 from .relevance import matches_curve
 from .verify import values_of
 
+# Smallest distance of a determined value from zero, in deviations: a 95 % interval excludes zero.
+_DETERMINED = 2.0
+
 
 def undetermined(found: Fit, added: int) -> tuple[AbstractEffect, ...]:
     """The effects, of those that a refit has added, of which the recordings determine no value.
 
-    A value is determined if its standard deviation is less than its size. If none is, the effect
-    is absent, or other parameters of the model can take its place.
+    A value is determined if it is at least two standard deviations from zero. If none is, the
+    effect is absent, or other parameters of the model can take its place. The deviations contain
+    the errors that noise of a recorded motion causes, which the score does not contain.
 
     **Arguments:**
 
@@ -27,7 +31,7 @@ def undetermined(found: Fit, added: int) -> tuple[AbstractEffect, ...]:
     effects = found.loop.effects
     last = range(len(effects) - added, len(effects))
     values = {k: [place for place, _ in values_of(found.loop, k)] for k in last}
-    known = found.std < np.abs(found.theta)
+    known = _DETERMINED * found.std < np.abs(found.theta)
     return tuple(effects[k] for k, own in values.items() if own and not known[own].any())
 
 

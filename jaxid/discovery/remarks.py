@@ -158,16 +158,22 @@ def _delayed(fit: Fit, given: ClosedLoop) -> list[str]:
         before = float(given.controller.late)
         if abs(value - before) > _APART * std:
             way = "later" if value > 0 else "earlier"
-            sampled = 0 < value <= LATE * fit.recordings.common_period()
+            samples = value / fit.recordings.common_period()
+            if _HELD[0] < samples < _HELD[1]:
+                cause = "as if it is held from one sample to the next"
+            elif 0 < samples <= LATE:
+                cause = (
+                    "which a sampled law, a bus or a filter can cause, but also a missing effect"
+                )
+            else:
+                cause = (
+                    "which a sampled law does not explain: check time stamps, and filters on one "
+                    "of the signals"
+                )
             found.append(
                 f"the torque is estimated to act {1e3 * abs(value):.3g} ± {1e3 * std:.2g} ms {way} "
                 + ("than recorded" if before == 0 else f"than recorded, not {1e3 * before:.3g} ms")
-                + (
-                    ", as if it is held from one sample to the next"
-                    if sampled
-                    else ", which a sampled law does not explain: check time stamps, and filters "
-                    "on one of the signals"
-                )
+                + f", {cause}"
             )
     return found
 

@@ -144,6 +144,16 @@ def offered(
     return scene, proposed
 
 
+def not_examined(loop: ClosedLoop, scene: Scene, catalogue: Sequence[Any]) -> list[str]:
+    """The effects of a catalogue, in words, that the recordings cannot show with this controller.
+
+    **Arguments:** as for `diagnose`.
+    """
+    proposed = [effect for effect, _ in candidates(catalogue, scene, 1.0)]
+    left_out = [e.spoken() for e in proposed if not _can_be_told(loop, e)]
+    return list(dict.fromkeys(left_out))
+
+
 def _can_be_told(loop: ClosedLoop, effect: AbstractEffect) -> bool:
     """Whether the recordings can show an effect, with this controller.
 

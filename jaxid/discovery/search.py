@@ -14,7 +14,7 @@ from ..simulation.loop import ClosedLoop
 from .diagnosis import over_recordings, share_left
 from .explore import DECISIVE, Candidate, explore, key_of, largest_first
 from .landscape import Landscape
-from .last_tries import doubtful, replaced, with_transmission, without_offset
+from .last_tries import ATTEMPTS
 from .likelihood import price
 from .loose import undetermined, with_fewer, without_loose
 from .models import LIKELY, Model, Named, listed
@@ -74,7 +74,7 @@ class Search(Started):
             if better is None and (better := self._without_one(at)) is not None:
                 gone = [n for n in at.names if n not in better.names]
                 self.removed = (*self.removed, *gone)
-            for attempt in (replaced, with_transmission, without_offset, doubtful):
+            for attempt in ATTEMPTS:
                 better = attempt(self, at) if better is None else better
             if better is None:
                 break

@@ -134,14 +134,14 @@ class Discovery(AbstractShown):
             return f"The model lacked {added}; with that, nothing is left to explain."
         lacked = f"The model lacked {added}; " if added else ""
         if not self.diagnosis.depends_on():
-            return capitalised(f"{lacked}no effect of the catalogue explains what is left.")
+            return capitalised(f"{lacked}none of the examined effects explains what is left.")
         hypothesis = self.diagnosis.where[0].hypothesis
         curve = hypothesis.effect
         assert isinstance(curve, Curve)
         on = "time" if curve.coordinate == "t" else f"the {curve.spoken_coordinate}"
         how = " and on the direction of motion" if curve.signed else ""
         return capitalised(
-            f"{lacked}no effect of the catalogue explains how the residual torque of joint "
+            f"{lacked}none of the examined effects explains how the residual torque of joint "
             f"{hypothesis.joint} depends on {on}{how}."
         )
 
@@ -269,6 +269,8 @@ class Discovery(AbstractShown):
             if measured is not None and np.isfinite(measured.percent[:, j]).all():
                 low, high = (over_recordings(x)[j] for x in (measured.low, measured.high))
                 label = f"{label} ({low:.3g} to {high:.3g} %)"
+            elif self.verdict in ("outside_catalogue", "undetermined"):
+                said += ", too high if an effect is missing"
             by_source.setdefault(said, []).append(label)
         return [f"noise floor {s}: {', '.join(labels)}" for s, labels in by_source.items()]
 

@@ -14,7 +14,7 @@ from ..effects import AbstractEffect, AbstractTransmission, check_declared
 from ..errors import FitError, MissingExtraError, ModelError
 from ..recording import Recording, Recordings, missing_after
 from ..simulation.batch import at_rest, motion_cutoff, prepare
-from ..simulation.checks import check_joints, check_law
+from ..simulation.checks import check_joints, check_law, check_loop
 from ..simulation.integrals import has_other_states, integral_states
 from ..simulation.loop import ClosedLoop
 from ..simulation.sharing import with_one_blas_thread
@@ -45,6 +45,7 @@ def fit(
 
     **Raises:** `FitError`, `RecordingError` or `ModelError` if the three do not match.
     """
+    check_loop(loop)
     recordings = Recordings.of(recordings)
     check_joints(loop, recordings[0])
     check_law(loop)

@@ -246,7 +246,7 @@ def _mistakes(
         order = np.arange(n)
         order[[i, j]] = j, i
         swapped = [dataclasses.replace(r, tau=r.tau[:, order]) for r in recordings]
-        said = f"the torques of joints {i + 1} and {j + 1} seem to be swapped"
+        said = f"the torques (or positions) of joints {i + 1} and {j + 1} seem to be swapped"
         yield said, Recordings.of(swapped), same
 
 

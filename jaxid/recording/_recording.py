@@ -3,6 +3,7 @@
 import html
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import equinox as eqx
@@ -265,7 +266,8 @@ class Recordings(eqx.Module):
         """
         if isinstance(recordings, Recordings):
             return recordings
-        several = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
+        alone = isinstance(recordings, (Recording, str, Path))
+        several = (recordings,) if alone else tuple(recordings)
         if not several:
             raise problem("Recordings", "there is no recording", "give at least one")
         for recording in several:

@@ -13,6 +13,15 @@ from ..recording import Recording
 from .loop import ClosedLoop
 
 
+def check_loop(loop: object) -> None:
+    """Raises `ModelError` for a first argument that is not a loop."""
+    if not isinstance(loop, ClosedLoop):
+        raise ModelError(
+            f"the first argument is a {type(loop).__name__}, not a loop: give the model first, "
+            "such as jaxid.scara() or jaxid.serial(...), then the recordings"
+        )
+
+
 def check_joints(loop: ClosedLoop, recording: Recording) -> None:
     """Raises `RecordingError` if a recording's number of joints differs from the loop's."""
     if recording.joints != loop.joints:

@@ -61,6 +61,11 @@ class ClosedLoop(eqx.Module):
 
     def __check_init__(self):
         for effect in self.effects:
+            if not isinstance(effect, AbstractEffect):
+                raise ModelError(
+                    f"{effect!r} is not an effect of {self.name}: give an object such as "
+                    "jaxid.effects.Viscous(joint=1)"
+                )
             joint = getattr(effect, "joint", None)
             if joint is not None and not 1 <= joint <= self.joints:
                 raise ModelError(
