@@ -233,8 +233,8 @@ def test_every_added_effect_must_be_determined(offset_case, offset_story):
     # The drag is not there, so its coefficient is at its bound, zero.
     assert undetermined(fit, 2) == (drag,)
     assert undetermined(fit, 1) == (drag,)
-    # A value is determined if its deviation is smaller than the value itself.
-    for std, found in ((0.5, (drag,)), (2.0, (offset, drag)), (np.inf, (offset, drag))):
+    # A value is determined if it is at least two deviations away from zero.
+    for std, found in ((0.49, (drag,)), (0.51, (offset, drag)), (np.inf, (offset, drag))):
         covariance = fit.covariance.copy()
         covariance[-2, -2] = (std * fit.theta[-2]) ** 2
         assert undetermined(dataclasses.replace(fit, covariance=covariance), 2) == found

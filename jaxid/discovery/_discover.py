@@ -346,8 +346,8 @@ def _not_examined(search: Search) -> list[str]:
     if not names:
         return []
     return [
-        f"not examined: {joined(names)}, because without the law the motion of this arm is not "
-        "simulated; with its law, an arm of up to three joints is examined for these as well"
+        f"not examined: {joined(names)}, because the motion of this arm is not simulated; that "
+        "needs a known continuous law and at most three joints"
     ]
 
 

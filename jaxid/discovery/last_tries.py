@@ -122,9 +122,10 @@ def with_free_shape(search: Examined, at: Model) -> Model | None:
             less = search.had(at, rest) or search.refitted(at, rest)
             # Its own filters describe a part of the missing effect as noise.
             less = dataclasses.replace(less, noise=at.noise)
-            found.append(_with_free_shapes(search, less, less))
-    best = min(found, key=lambda m: m.score, default=at)
-    return best if best is not at and best.score < at.score + LIKELY else None
+            again = _with_free_shapes(search, less, less)
+            if again is not less and again.score < at.score + LIKELY:
+                found.append(again)
+    return min(found, key=lambda m: m.score, default=None)
 
 
 def doubtful(search: Examined, at: Model) -> Model | None:
