@@ -11,7 +11,7 @@ from test_release import DRY, axis, recorded
 import jaxid
 from jaxid.discovery.asked import Asked
 from jaxid.discovery.fits import Fits
-from jaxid.discovery.last_tries import replaced, with_free_shape
+from jaxid.discovery.last_tries import replaced, replaced_by_shape
 from jaxid.discovery.models import Model
 from jaxid.discovery.search import Search
 from jaxid.discovery.shapes import (
@@ -149,13 +149,14 @@ def test_an_effect_that_corrects_a_held_shape_is_compared_with_the_shape_free(en
     both = refits.filtered(peak.fit.loop.add(QuadraticDrag(1)), peak.noise)
     at = search.visit(search.added(both), both)
     assert at.score < held.score - 20
-    found = with_free_shape(search, at)
+    found = replaced_by_shape(search, at)
     assert found is not None
     assert found.names == (("stribeck", 1),)
     assert "ds1" in found.fit.loop.names
     assert found.score < at.score - 20
+    assert any("quadratic_drag on joint 1: not needed if" in said for said in search.failures)
     # Nothing else has a held shape, so the result is final.
-    assert with_free_shape(search, found) is None
+    assert replaced_by_shape(search, found) is None
 
 
 def test_a_true_effect_stays_beside_a_free_shape():
@@ -164,7 +165,7 @@ def test_a_true_effect_stays_beside_a_free_shape():
     search, _, _ = searched(refits, peak)
     both = refits.filtered(peak.fit.loop.add(QuadraticDrag(1)), peak.noise)
     at = search.visit(search.added(both), both)
-    assert with_free_shape(search, at) is None
+    assert replaced_by_shape(search, at) is None
 
 
 def test_a_rival_whose_shape_is_held_is_fitted_with_the_shape_free(ended):

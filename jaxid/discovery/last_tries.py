@@ -103,7 +103,7 @@ def _with_free_shapes(search: Examined, best: Model, rival: Model) -> Model:
     return _better(search, best, rival.effects, again)
 
 
-def with_free_shape(search: Examined, at: Model) -> Model | None:
+def replaced_by_shape(search: Examined, at: Model) -> Model | None:
     """The best fit without one effect and with held shapes on its joint free; None if the effect is
     needed beside them.
 
@@ -114,7 +114,7 @@ def with_free_shape(search: Examined, at: Model) -> Model | None:
     assert at.fit is not None
     if not imposed(at.fit.loop):
         return None
-    found = []
+    best = None
     for gone in at.effects:
         rest = tuple(e for e in at.effects if e is not gone)
         joint = getattr(gone, "joint", None)
@@ -123,9 +123,13 @@ def with_free_shape(search: Examined, at: Model) -> Model | None:
             # Its own filters describe a part of the missing effect as noise.
             less = dataclasses.replace(less, noise=at.noise)
             again = _with_free_shapes(search, less, less)
-            if again is not less and again.score < at.score + LIKELY:
-                found.append(again)
-    return min(found, key=lambda m: m.score, default=None)
+            limit = at.score + LIKELY if best is None else best.score
+            if again is not less and again.score < limit:
+                best, needless = again, gone
+    if best is not None:
+        said = "not needed if the shapes of the other effects on its joint are estimated"
+        search.note(f"{listed((needless,))}: {said}")
+    return best
 
 
 def doubtful(search: Examined, at: Model) -> Model | None:
@@ -252,4 +256,4 @@ def _better(
 
 
 # In the order in which they are tried.
-ATTEMPTS = replaced, with_free_shape, with_transmission, without_offset, doubtful
+ATTEMPTS = replaced, replaced_by_shape, with_transmission, without_offset, doubtful
