@@ -10,6 +10,7 @@ import pytest
 from test_discover_cli import told
 
 import jaxid
+from jaxid.discovery.floor import Floor
 from jaxid.display import figures
 from jaxid.errors import ModelError
 from jaxid.report import write_report
@@ -164,6 +165,24 @@ def test_what_cannot_be_told_is_a_page_that_says_why(tmp_path: Path) -> None:
     assert f"T{why[1:]}." in shown
     assert "Nothing is missing" not in shown
     assert "Models that were compared" in shown
+
+
+def test_a_floor_that_a_doubtful_model_has_estimated_is_called_too_high(tmp_path: Path) -> None:
+    last = told().story.steps[-1]
+    percent = np.ones((len(last.fit.recordings), told().story.loop.joints))
+    measured = Floor(percent, percent, percent, (("repeats",) * percent.shape[1],) * len(percent))
+
+    def story(verdict, floor):
+        steps = (dataclasses.replace(last, diagnosis=dataclasses.replace(last.diagnosis, **floor)),)
+        return dataclasses.replace(told().story, verdict=verdict, reason="a test", steps=steps)
+
+    sure = story("explained", {"measured": None})
+    doubtful = story("undetermined", {"measured": None})
+    known = story("undetermined", {"measured": measured})
+    for shown, warned in ((sure, False), (doubtful, True), (known, False)):
+        page = Page(write_report(shown, tmp_path / "floor.html").read_text(encoding="utf-8"))
+        assert ("it is too high where a model" in " ".join(page.shown)) == warned
+        assert ("too high if an effect is missing" in " ".join(repr(shown).split())) == warned
 
 
 def test_text_is_escaped_unless_it_is_markup() -> None:

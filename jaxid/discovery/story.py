@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..display.shown import AbstractShown
 from ..effects import AbstractEffect, Curve
@@ -257,11 +257,24 @@ class Discovery(AbstractShown):
         """Relative error that a perfect model would leave on the fitted recordings, %."""
         return self.diagnosis.floor_percent()
 
+    def floor_in_doubt(self) -> Bool[np.ndarray, " joints"]:
+        """For which joints the noise floor is too high if an effect is missing.
+
+        It is estimated by a model there, and no examined model passes the tests.
+        """
+        measured = self.diagnosis.measured
+        if self.verdict not in ("outside_catalogue", "undetermined"):
+            return np.zeros(self.loop.joints, bool)
+        if measured is None:
+            return np.ones(self.loop.joints, bool)
+        return np.asarray(~np.isfinite(measured.percent).all(axis=0))
+
     def _floor_sources(self) -> list[str]:
         """Sources of the noise floor, with its interval if it was measured."""
         joints = joint_columns(self.loop.joints)
         measured = self.diagnosis.measured
         by_source: dict[str, list[str]] = {}
+        doubtful = self.floor_in_doubt()
         for j, (label, sources) in enumerate(
             zip(joints, self.diagnosis.floor_sources(), strict=True)
         ):
@@ -269,7 +282,7 @@ class Discovery(AbstractShown):
             if measured is not None and np.isfinite(measured.percent[:, j]).all():
                 low, high = (over_recordings(x)[j] for x in (measured.low, measured.high))
                 label = f"{label} ({low:.3g} to {high:.3g} %)"
-            elif self.verdict in ("outside_catalogue", "undetermined"):
+            elif doubtful[j]:
                 said += ", too high if an effect is missing"
             by_source.setdefault(said, []).append(label)
         return [f"noise floor {s}: {', '.join(labels)}" for s, labels in by_source.items()]

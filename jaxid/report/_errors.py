@@ -37,6 +37,8 @@ def errors(beside: Beside) -> Markup:
         "step. The noise floor is the error that a perfect model would leave, as estimated on the "
         f"fitted recordings. A ratio below {NEAR:g} means that the residual is almost only noise."
     )
+    if story.floor_in_doubt().any():
+        said += " If an effect is missing, it is too high where a model has estimated it."
     shown = table(columns, rows, "relative error in % by recording, joint and step")
     return section("All recordings, joints and steps", tag("p", said), shown)
 
