@@ -17,7 +17,6 @@ from jaxid.discovery.undecided import undecided
 from jaxid.discovery.verdict import (
     _power,
     _spread,
-    _through,
     indefinite,
     on_unseen,
     refuted,
@@ -257,7 +256,7 @@ def test_variance_of_a_sum_with_noise_is_the_covariance():
     delta = np.cos(np.arange(200) * 0.1)
     lags = np.fft.ifft(NOISE.spectrum(4096)).real[:200]
     exact = delta @ scipy.linalg.toeplitz(lags) @ delta
-    assert _through(NOISE, delta) == pytest.approx(exact, rel=0.01)
+    assert NOISE.product_variance(delta) == pytest.approx(exact, rel=0.01)
 
 
 def test_the_table_of_models_tells_what_each_is_worth(found):

@@ -22,6 +22,7 @@ from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
 from .alongside import along_recorded, in_the_loop, one_late_drive, without_law
 from .asked import Asked, check_apart
+from .dependence import depends_on_motion
 from .diagnosis import over_recordings
 from .held_out import diverges, on_held_out, raised, tested, with_held_out
 from .hypotheses import effect_on
@@ -32,6 +33,7 @@ from .remarks import remarks
 from .screening import not_examined
 from .search import Search
 from .shapes import with_shapes
+from .slow_noise import floor_with_slow_noise
 from .step import Step
 from .story import Discovery
 from .text import joined
@@ -217,6 +219,8 @@ def _told(
     """The result of a search, with errors on held-out recordings."""
     models = search.visited.weighed(search.at)
     steps = tested(search, _steps(search, models))
+    if not interrupted:
+        steps = [*steps[:-1], _with_slow_noise(search, steps[-1])]
     models = with_held_out(search, models, steps)
     short = _stopped_short(search.asked.most)
     reason = _STOPPED if interrupted else diverges(search, steps[-1]) or raised(search, steps)
@@ -237,6 +241,13 @@ def _told(
         steps, reason = _final(search, steps)
         models = tuple(_as_shown(m, steps[-1]) if m.fit is search.at.fit else m for m in models)
         steps = _without_probabilities(steps) if reason else steps
+    if not interrupted and not reason and verdict != "outside_catalogue":
+        last, noise = steps[-1], search.at.noise
+        assert last.diagnosis is not None
+        reason = depends_on_motion(
+            last.fit, last.diagnosis, noise, last.held_out, search.asked.worth
+        )
+        steps = _without_probabilities(steps) if reason else steps
     notes = (*remarks(steps, search.given, search.offsets), *search.failures)
     notes = (*notes, *_not_examined(search))
     notes = (*_without_recordings(search.asked.recordings, steps[0].fit), *notes)
@@ -253,6 +264,16 @@ def _told(
         unfinished=unfinished,
         interrupted=interrupted,
     )
+
+
+def _with_slow_noise(search: Search, last: Step) -> Step:
+    """The last step, with the noise floor of joints whose residual is shown to be slow noise."""
+    if last.diagnosis is None or last.fit.status is not Status.converged:
+        return last
+    noise, worth = search.at.noise, search.asked.worth
+    floor = floor_with_slow_noise(last.fit, last.diagnosis, noise, last.held_out, worth)
+    diagnosis = dataclasses.replace(last.diagnosis, measured=floor)
+    return dataclasses.replace(last, diagnosis=diagnosis)
 
 
 def _without_probabilities(steps: Sequence[Step]) -> list[Step]:
@@ -285,8 +306,9 @@ def _final(search: Search, steps: Sequence[Step]) -> tuple[list[Step], str]:
     unseen = on_held_out(search, fit)
     last, reason = dataclasses.replace(last, fit=fit, held_out=unseen), ""
     if steps[0].held_out is not None and unseen is not None:
-        noise, worth = search.at.noise, search.asked.worth
-        reason = refuted_unseen(fit, noise, steps[0].held_out, unseen, worth)
+        assert last.diagnosis is not None
+        noise, measured = search.at.noise, last.diagnosis.measured
+        reason = refuted_unseen(fit, noise, measured, steps[0].held_out, unseen, search.asked.worth)
     return [*steps[:-1], last], reason
 
 

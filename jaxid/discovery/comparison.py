@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..control import OpenLoop
 from ..display.shown import AbstractShown
@@ -21,6 +21,7 @@ from ..estimate.regression import filtered
 from ..estimate.result import errors_to_dict, joint_columns, relative_errors
 from ..noise import autocorrelation
 from ..recording import Recording, Recordings
+from ..signals.smoothing import Band
 from ..simulation.batch import band_of, compared_torques, prepare
 from ..simulation.integration import reason
 from ..simulation.loop import ClosedLoop
@@ -82,10 +83,18 @@ class Comparison(AbstractShown):
         torques = [np.asarray(x.tau) for x in self.runs]
         both = compared_torques(self.loop, self.recordings, torques)
         measured, simulated = (signals[k] for signals in both)
-        if band is None:
-            return record.time, measured, simulated
-        rows = np.asarray(band.rows)[k][np.asarray(band.keep)[k]]
-        return record.time[rows], measured, simulated
+        return record.time[_rows(band, k)], measured, simulated
+
+    def compared_motion(self, recording: int | str = 0) -> tuple[np.ndarray, ...]:
+        """Simulated position, velocity and acceleration as compared, each `(samples, joints)`.
+
+        **Arguments:**
+
+        - `recording`: number from 0, or name.
+        """
+        k = self._index(recording)
+        run, rows = self.runs[k], _rows(band_of(self.loop, self.recordings), k)
+        return tuple(np.asarray(x)[rows] for x in (run.q, run.v, run.a))
 
     def shown(self, recording: int | str = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As `judged`, for a figure: NaN while a joint is at rest and is not compared.
@@ -197,6 +206,13 @@ class Comparison(AbstractShown):
     def _repr_html_(self) -> str:
         head = html.escape(f"{self.loop.name}, relative error in %")
         return f"<p>{head}</p>{self.errors.to_html(float_format='%.4g')}"
+
+
+def _rows(band: Band | None, recording: int) -> slice | Int[np.ndarray, " rows"]:
+    """The compared samples of a recording."""
+    if band is None:
+        return slice(None)
+    return np.asarray(band.rows)[recording][np.asarray(band.keep)[recording]]
 
 
 @with_one_blas_thread

@@ -349,11 +349,13 @@ class Diagnosis(AbstractShown):
         It is estimated from the recordings alone if they determine it, otherwise by a model with
         every effect and curve that matters.
         """
+        return over_recordings(self.floor_by_recording())
+
+    def floor_by_recording(self) -> Float[np.ndarray, "recordings joints"]:
+        """As `floor_percent`, for each recording."""
         if self.measured is None:
-            return over_recordings(self.floor)
-        return over_recordings(
-            np.where(np.isfinite(self.measured.percent), self.measured.percent, self.floor)
-        )
+            return self.floor
+        return np.where(np.isfinite(self.measured.percent), self.measured.percent, self.floor)
 
     def floor_sources(self) -> tuple[tuple[str, ...], ...]:
         """Sources of the noise floor by joint: measurement methods, or "rich model"."""

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..noise import Level, above_motion, from_repeats
 from ..recording import Recording, Recordings
@@ -17,6 +17,7 @@ from ..simulation.loop import ClosedLoop
 SPOKEN = {
     "repeats": "from recordings that repeat a reference",
     "above the motion": "from the torque above the motion's frequencies",
+    "unpredicted": "from a residual that does not depend on the motion",
     "rich model": "from the residual of a model with all effects that matter",
 }
 
@@ -26,13 +27,19 @@ class Floor(eqx.Module):
 
     - `percent`, `low`, `high`: its estimate and 95 % interval; NaN if the recordings do not
       determine it.
-    - `sources`: by recording and joint, "repeats" or "above the motion"; empty if not determined.
+    - `sources`: by recording and joint, "repeats", "above the motion" or "unpredicted"; empty if
+      not determined.
     """
 
     percent: Float[np.ndarray, "recordings joints"]
     low: Float[np.ndarray, "recordings joints"]
     high: Float[np.ndarray, "recordings joints"]
     sources: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+
+    @property
+    def slow(self) -> Bool[np.ndarray, " joints"]:
+        """Joints whose noise is slow, so that its level above the motion is too low."""
+        return np.asarray(np.all(np.array(self.sources) == "unpredicted", axis=0))
 
 
 def floor_of(

@@ -1,5 +1,6 @@
 """Tests that the final model must pass; otherwise the verdict is `undetermined`."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Literal
 
@@ -97,21 +98,35 @@ def refuted(
     )
     if held_out is None or reason:
         return reason
-    return refuted_unseen(chosen, noise, *held_out, worth)
+    return refuted_unseen(chosen, noise, diagnosis.measured, *held_out, worth)
 
 
 def refuted_unseen(
-    chosen: Fit, noise: Sequence[ARFilter], before: Comparison, after: Comparison, worth: float
+    chosen: Fit,
+    noise: Sequence[ARFilter],
+    measured: Floor | None,
+    before: Comparison,
+    after: Comparison,
+    worth: float,
 ) -> str:
     """The first test on held-out recordings that a model fails, as a reason.
 
-    **Arguments:** as for `refuted`; `before` is the starting model, and `after` the chosen one.
+    **Arguments:** as for `refuted`; `measured` is the noise floor of the fitted recordings without
+    a model, `before` the starting model, and `after` the chosen one.
     """
     return (
         risen(before, after, noise, worth)
         or _above_noise(chosen, after, noise, worth)
-        or _above_measured(after, floor_of(after.loop, after.recordings, chosen.recordings), worth)
+        or _above_measured(after, _floor_of_unseen(chosen, measured, after), worth)
     )
+
+
+def _floor_of_unseen(fit: Fit, measured: Floor | None, unseen: Comparison) -> Floor | None:
+    """The measured noise floor of held-out recordings, without joints with slow noise."""
+    floor = floor_of(unseen.loop, unseen.recordings, fit.recordings)
+    if floor is None or measured is None:
+        return floor
+    return dataclasses.replace(floor, percent=np.where(measured.slow, np.nan, floor.percent))
 
 
 def explains_little(fit: Fit, noise: Sequence[ARFilter], measured: Floor | None) -> str:
@@ -161,7 +176,7 @@ def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
         late = float(own @ left) / max(float(own @ own), 1e-300)
         rows = own.reshape(rate.shape)
         pairs = enumerate(diagnosis.noise)
-        chance = np.sqrt(sum(_through(f, x[:, o]) for o, f in pairs for x in rows))
+        chance = np.sqrt(sum(f.product_variance(x[:, o]) for o, f in pairs for x in rows))
         rest = left.reshape(rate.shape)[..., j]
         part = abs(late) * np.linalg.norm(rows[..., j]) / np.linalg.norm(rest)
         large = part**2 > 1 - 1 / REFUTED**2 and part * percent[j] > worth
@@ -258,16 +273,10 @@ def _raised(
         changed = [b - a for b, a in pairs]
         moved = sum(float(d @ d) for d in changed)
         # Twice the standard deviation of the sum of noise times change, whose mean is zero.
-        chance = 2 * np.sqrt(sum(_through(filt, d) for d in changed))
+        chance = 2 * np.sqrt(sum(filt.product_variance(d) for d in changed))
         if errors[1][j] - errors[0][j] > worth and rise + moved > _ROSE * chance:
             found.append(j)
     return found
-
-
-def _through(filt: ARFilter, x: Float[np.ndarray, " samples"]) -> float:
-    """Variance of the scalar product of a series and noise of a filter."""
-    size = 2 * len(x)
-    return float(np.sum(np.abs(np.fft.fft(x, size)) ** 2 * filt.spectrum(size)) / size)
 
 
 def _above_noise(fit: Fit, held_out: Comparison, noise: Sequence[ARFilter], worth: float) -> str:

@@ -81,6 +81,11 @@ class ARFilter(eqx.Module):
         """Power at the `size` frequencies of a discrete Fourier transform."""
         return self.variance / np.abs(np.fft.fft(self.polynomial, size)) ** 2
 
+    def product_variance(self, x: Float[np.ndarray, " samples"]) -> float:
+        """Variance of the scalar product of a series and this noise."""
+        size = 2 * len(x)
+        return float(np.sum(np.abs(np.fft.fft(x, size)) ** 2 * self.spectrum(size)) / size)
+
     def whiten(self, x: Float[np.ndarray, "samples *axes"]) -> Float[np.ndarray, "samples *axes"]:
         """A(z) x along the first axis; samples before the first count as zero."""
         import scipy

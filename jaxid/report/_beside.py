@@ -45,7 +45,7 @@ class Beside:
         """Relative error due to noise alone, %, as estimated on the fitted recordings."""
         story = self.story
         if not self.unseen:
-            return story.diagnosis.floor
+            return story.diagnosis.floor_by_recording()
         return np.broadcast_to(story.noise_floor_percent(), self.error.shape)
 
     def noise(self, recording: int) -> Float[np.ndarray, " joints"]:

@@ -26,7 +26,8 @@ def errors(beside: Beside) -> Markup:
     """Relative errors of recordings and joints by step, with the noise floor."""
     story = beside.story
     fitted = [step.fit.error_percent.to_numpy() for step in story.steps]
-    rows = _rows("fitted", story.fit.recordings.names, fitted, story.diagnosis.floor)
+    floor = story.diagnosis.floor_by_recording()
+    rows = _rows("fitted", story.fit.recordings.names, fitted, floor)
     if beside.unseen:
         held = [s.held_out.error_percent.to_numpy() for s in story.steps if s.held_out is not None]
         rows += _rows("held out", beside.after.recordings.names, held, beside.floor)

@@ -1,0 +1,149 @@
+"""The noise floor of joints whose residual is above the measured floor, and is noise all the same.
+
+Above the motion's frequencies only white noise is measured, and a model with all effects absorbs
+slow noise. Torque that drifts is then taken for a missing effect. But the torque of an effect can
+be predicted from the motion of another recording, and noise cannot.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..estimate import Fit
+from ..noise import ARFilter
+from .comparison import Comparison
+from .dependence import Rows, among, on_others
+from .diagnosis import Diagnosis, over_recordings
+from .explore import DECISIVE
+from .floor import Floor
+from .relevance import allowed
+from .score import spanned
+
+# A residual below the first number of deviations does not depend on the motion. At least half of
+# the functions of the motion that are tried must be above the second one.
+_NONE, _SEEN = 3.0, 6.0
+# Number of functions of the motion for which this is tried, and standard deviation of their wave
+# numbers, in radians over the standard deviation of position and velocity.
+_TRIED, _WAVES = 8, 1.5
+
+
+def floor_with_slow_noise(
+    chosen: Fit,
+    diagnosis: Diagnosis,
+    noise: Sequence[ARFilter],
+    held_out: Comparison | None,
+    worth: float,
+) -> Floor | None:
+    """The measured noise floor; for joints with slow noise it is their error.
+
+    **Arguments:**
+
+    - `chosen`: the fit of the model with the best score. `diagnosis`: of this fit.
+    - `noise`: noise filters of its residual, one per joint.
+    - `held_out`: comparison of the model with held-out recordings; None if there are none.
+    - `worth`: smallest relevant change, in % of a joint's torque.
+    """
+    left, measured = chosen.error_percent.to_numpy(), diagnosis.measured
+    high = above_floors(chosen, diagnosis, worth)
+    if left.shape != diagnosis.floor.shape or not high.any():
+        return measured
+    rows = Rows.of_fit(chosen, diagnosis)
+    unseen = None if held_out is None else Rows.of_comparison(held_out)
+    low = np.minimum(diagnosis.floor, left)
+    if measured is not None:
+        low = np.where(np.isfinite(measured.low), np.minimum(measured.low, low), low)
+    slow = np.zeros(len(high), bool)
+    for j in np.flatnonzero(high).tolist():
+        free = 1 - min(float(over_recordings(low)[j] / over_recordings(left)[j]), 1.0) ** 2
+        slow[j] = _independent(rows, unseen, j, noise[j]) and _would_be_seen(
+            rows, diagnosis, j, noise[j], free
+        )
+    return _raised(measured, left, low, slow)
+
+
+def above_floors(chosen: Fit, diagnosis: Diagnosis, worth: float) -> Bool[np.ndarray, " joints"]:
+    """Joints whose error is above the noise floor that was measured or of the model with all
+    effects."""
+    left, (limit, least) = chosen.error_percent.to_numpy(), allowed(chosen.loop, worth)
+    rich = diagnosis.floor_percent() if diagnosis.unexplained >= DECISIVE else np.inf
+    total = over_recordings(left)
+    found = (total > limit * rich) & (total**2 - rich**2 > least**2)
+    if diagnosis.measured is not None:
+        floor = np.where(np.isfinite(diagnosis.measured.high), diagnosis.measured.high, np.inf)
+        found |= np.any((left > limit * floor) & (left**2 - floor**2 > least**2), axis=0)
+    return found
+
+
+def _independent(rows: Rows, unseen: Rows | None, joint: int, filt: ARFilter) -> bool:
+    """Whether no regression predicts the residual of other recordings from their motion."""
+    found = [among(rows, joint, filt)]
+    if unseen is not None:
+        found.append(on_others(rows, unseen, joint, filt))
+    tried = [x for x in found if x is not None]
+    return bool(tried) and all(x.deviations < _NONE for x in tried)
+
+
+def _would_be_seen(
+    rows: Rows, diagnosis: Diagnosis, joint: int, filt: ARFilter, share: float
+) -> bool:
+    """Whether the regression sees most functions of the motion as large as what is above the floor.
+
+    **Arguments:**
+
+    - `share`: of the residual's power that is above the floor.
+    """
+    count = np.cumsum([len(r) for r in rows.residual])[:-1]
+    rest = np.concatenate(rows.residual)
+    found = []
+    for torque in _torques(rows, diagnosis, joint):
+        size = np.sqrt(share * np.sum(rest[:, joint] ** 2))
+        changed = np.sqrt(1 - share) * rest
+        changed[:, joint] += size * torque / np.linalg.norm(torque)
+        changed[rest == 0] = 0
+        with_effect = Rows(rows.motion, tuple(np.split(changed, count)))
+        seen = among(with_effect, joint, filt)
+        found.append(0.0 if seen is None else seen.deviations)
+    return bool(found) and float(np.median(found)) > _SEEN
+
+
+def _torques(rows: Rows, diagnosis: Diagnosis, joint: int) -> Iterable[Float[np.ndarray, " rows"]]:
+    """What the model cannot absorb of random functions of a joint's position and velocity.
+
+    They are waves over the two, every second one with the sign of the velocity, as friction has it.
+    """
+    data, rng = diagnosis.data, np.random.default_rng(0)
+    joints = data.residual.shape[2]
+    motion = np.concatenate(rows.motion)
+    q, v = motion[:, joint], motion[:, joints + joint]
+    basis = spanned(data.base[data.mask].reshape(-1, data.base.shape[-1]))
+    for number in range(_TRIED):
+        waves, phase = rng.normal(size=2) * _WAVES, rng.uniform(0, 2 * np.pi)
+        torque = np.cos(waves[0] * q / np.std(q) + waves[1] * v / np.std(v) + phase)
+        whole = np.zeros((len(q), joints))
+        whole[:, joint] = torque * (np.sign(v) if number % 2 else 1.0)
+        left = whole.reshape(-1)
+        yield (left - basis @ (basis.T @ left)).reshape(whole.shape)[:, joint]
+
+
+def _raised(
+    measured: Floor | None,
+    left: Float[np.ndarray, "recordings joints"],
+    low: Float[np.ndarray, "recordings joints"],
+    slow: Bool[np.ndarray, " joints"],
+) -> Floor | None:
+    """The measured floor, with the error of the joints with slow noise."""
+    if not slow.any():
+        return measured
+    unknown = np.full(left.shape, np.nan)
+    sources = (("",) * left.shape[1],) * left.shape[0]
+    before = measured or Floor(unknown, unknown, unknown, sources)
+    return Floor(
+        np.where(slow, left, before.percent),
+        np.where(slow, low, before.low),
+        np.where(slow, left, before.high),
+        tuple(
+            tuple("unpredicted" if is_slow else x for x, is_slow in zip(row, slow, strict=True))
+            for row in before.sources
+        ),
+    )

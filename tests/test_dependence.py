@@ -1,0 +1,168 @@
+"""Whether a residual depends on the motion, and slow noise that a floor takes for an effect."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxid
+from jaxid.control import Tracking
+from jaxid.discovery.dependence import Rows, among, depends_on_motion, on_others
+from jaxid.discovery.slow_noise import above_floors, floor_with_slow_noise
+from jaxid.noise import ARFilter
+
+SLOW = ARFilter(np.array([-1.6, 0.62]), 1.0)
+WORTH = 0.05
+
+
+def motion_of(rng: np.random.Generator, samples: int = 600, joints: int = 1) -> np.ndarray:
+    """Position, velocity, acceleration and direction of sums of sines, at 50 Hz."""
+    time = np.arange(samples) / 50
+    parts = np.zeros((3, samples, joints))
+    for _ in range(4):
+        w = 2 * np.pi * rng.uniform(0.2, 1.5, joints)
+        phase = np.outer(time, w) + rng.uniform(0, 6, joints)
+        parts += np.sin(phase), w * np.cos(phase), -(w**2) * np.sin(phase)
+    q, v, a = parts
+    return np.concatenate([q, v, a, np.sign(v)], axis=1)
+
+
+def friction(motion: np.ndarray) -> np.ndarray:
+    """Dry friction of the first joint that grows with the distance from the centre."""
+    joints = motion.shape[1] // 4
+    return motion[:, 3 * joints] * motion[:, 0] ** 2
+
+
+def drawn(seed: int, size: float = 0.0, louder: float = 1.0, joints: int = 1) -> tuple[Rows, Rows]:
+    """Rows of two recordings and of a third one: slow noise, and friction of some size."""
+    rng = np.random.default_rng(seed)
+    motion = [motion_of(rng, joints=joints) for _ in range(3)]
+    rest = [SLOW.simulate((joints, len(m)), rng).T for m in motion]
+    level = np.sqrt(SLOW.gain)
+    for m, r in zip(motion, rest, strict=True):
+        r[:, 0] += size * level * friction(m) / np.std(friction(m))
+    rest[2] = louder * rest[2]
+    return Rows(tuple(motion[:2]), tuple(rest[:2])), Rows((motion[2],), (rest[2],))
+
+
+@pytest.mark.parametrize("louder", [1.0, 3.0])
+def test_deviations_of_slow_noise_are_standard(louder):
+    found = []
+    for seed in range(40):
+        rows, other = drawn(seed, louder=louder)
+        found += [among(rows, 0, SLOW).deviations, on_others(rows, other, 0, SLOW).deviations]
+    # The standard deviation of eighty draws is known to a twelfth.
+    assert np.std(found) == pytest.approx(1.0, abs=0.25)
+    assert abs(np.mean(found)) < 0.4
+    assert max(found) < 3.5
+
+
+def test_a_function_of_the_motion_is_seen_in_a_recording_that_it_was_not_trained_on():
+    for seed in range(5):
+        rows, other = drawn(seed, size=1.0)
+        seen = on_others(rows, other, 0, SLOW)
+        assert seen.deviations > 8
+        # Half of the power; a regression reaches a part of it.
+        assert 0.15 < seen.share < 0.65
+        assert among(rows, 0, SLOW).deviations > 8
+
+
+def test_friction_is_seen_among_the_motions_of_many_joints():
+    rows, other = drawn(3, size=1.0, joints=5)
+    assert on_others(rows, other, 0, SLOW).deviations > 8
+    assert on_others(rows, other, 1, SLOW).deviations < 4
+
+
+def test_one_recording_cannot_be_predicted_from_others():
+    rows, _ = drawn(0)
+    assert among(rows.only([0]), 0, SLOW) is None
+
+
+def test_rows_that_are_not_compared_are_left_out():
+    rows, other = drawn(4, size=1.0)
+    seen = on_others(rows, other, 0, SLOW)
+    kept = other.residual[0].copy()
+    kept[::3] = 0
+    fewer = on_others(rows, Rows(other.motion, (kept,)), 0, SLOW)
+    assert 3 < fewer.deviations < seen.deviations
+    nothing = Rows(rows.motion, tuple(np.zeros_like(r) for r in rows.residual))
+    assert on_others(nothing, other, 0, SLOW).deviations == 0
+    assert on_others(nothing, other, 0, SLOW).share == 0
+
+
+def recorded(name: str, seed: int, missing: float = 0.0, drift: float = 0.0) -> jaxid.Recording:
+    """A slide with dry friction in closed form, 20 s at 200 Hz, its torque with noise.
+
+    **Arguments:**
+
+    - `missing`: size of a friction force that depends on position and velocity, N.
+    - `drift`: standard deviation of a slow random walk after a second, N.
+    """
+    rng = np.random.default_rng(seed)
+    time = np.arange(4000) / 200
+    q, v, a = np.zeros((3, len(time)))
+    for w in 2 * np.pi * rng.uniform(0.2, 1.2, 4):
+        phase, size = w * time + rng.uniform(0, 6), 0.3 / w
+        q += size * np.sin(phase)
+        v += size * w * np.cos(phase)
+        a -= size * w**2 * np.sin(phase)
+    tau = 2.0 * a + 0.8 * v + 1.5 * np.tanh(v / 0.005)
+    tau += missing * np.sign(v) * np.sin(25 * q) * np.tanh((v / 0.15) ** 2)
+    tau += 0.02 * rng.standard_normal(len(time))
+    tau += drift * np.cumsum(rng.standard_normal(len(time))) / np.sqrt(200)
+    return jaxid.Recording.from_arrays(time, q[:, None], tau[:, None], name=name)
+
+
+def diagnosed(**made: float):
+    """Fit, diagnosis and held-out comparison of a slide with an unknown law."""
+    one, two, three = (recorded(f"r{k}", 10 + k, **made) for k in range(3))
+    fit = jaxid.fit(jaxid.robots.emps(Tracking(cutoff=20.0)), [one, two])
+    return fit, jaxid.diagnose(fit, progress=False), jaxid.compare(fit, three)
+
+
+@pytest.fixture(scope="module")
+def drifting():
+    return diagnosed(drift=0.1)
+
+
+@pytest.fixture(scope="module")
+def lacking():
+    return diagnosed(missing=0.3)
+
+
+def test_the_floor_of_torque_that_drifts_is_its_error(drifting):
+    fit, diagnosis, held_out = drifting
+    before, left = diagnosis.measured, fit.error_percent.to_numpy()
+    # White noise above the motion is a small part of the error.
+    assert above_floors(fit, diagnosis, WORTH).all()
+    there = np.isfinite(before.high)
+    assert there.any()
+    assert np.all(left[there] > 10 * before.high[there])
+    after = floor_with_slow_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
+    assert after.slow.all()
+    assert not before.slow.any()
+    np.testing.assert_allclose(after.percent, left)
+    np.testing.assert_array_equal(after.low[there], before.low[there])
+    assert np.all(after.low < left)
+    assert depends_on_motion(fit, diagnosis, diagnosis.noise, held_out, WORTH) == ""
+    changed = dataclasses.replace(diagnosis, measured=after)
+    assert changed.floor_sources() == (("unpredicted",),)
+    assert not above_floors(fit, changed, WORTH).any()
+
+
+def test_a_missing_effect_is_not_slow_noise(lacking):
+    fit, diagnosis, held_out = lacking
+    assert above_floors(fit, diagnosis, WORTH).all()
+    after = floor_with_slow_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
+    assert after is diagnosis.measured
+
+
+def test_an_effect_of_no_known_formula_is_told_from_other_recordings(lacking):
+    fit, diagnosis, held_out = lacking
+    said = depends_on_motion(fit, diagnosis, diagnosis.noise, held_out, WORTH)
+    assert said.startswith("on the held-out recordings the error of joint 1 is")
+    assert "an effect is missing" in said
+    alone = depends_on_motion(fit, diagnosis, diagnosis.noise, None, WORTH)
+    assert alone.startswith("on the fitted recordings")
+    # What the user does not find worth knowing is not told.
+    assert depends_on_motion(fit, diagnosis, diagnosis.noise, held_out, 50.0) == ""
