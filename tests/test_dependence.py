@@ -7,7 +7,7 @@ import pytest
 
 import jaxid
 from jaxid.control import Tracking
-from jaxid.discovery.dependence import Rows, among, depends_on_motion, on_others
+from jaxid.discovery.dependence import ComparedRows, among, depends_on_motion, on_others
 from jaxid.discovery.slow_noise import above_floors, floor_with_slow_noise
 from jaxid.noise import ARFilter
 
@@ -33,8 +33,10 @@ def friction(motion: np.ndarray) -> np.ndarray:
     return motion[:, 3 * joints] * motion[:, 0] ** 2
 
 
-def drawn(seed: int, size: float = 0.0, louder: float = 1.0, joints: int = 1) -> tuple[Rows, Rows]:
-    """Rows of two recordings and of a third one: slow noise, and friction of some size."""
+def drawn(
+    seed: int, size: float = 0.0, louder: float = 1.0, joints: int = 1
+) -> tuple[ComparedRows, ComparedRows]:
+    """The rows of two recordings and of a third one: slow noise, and friction of some size."""
     rng = np.random.default_rng(seed)
     motion = [motion_of(rng, joints=joints) for _ in range(3)]
     rest = [SLOW.simulate((joints, len(m)), rng).T for m in motion]
@@ -42,7 +44,7 @@ def drawn(seed: int, size: float = 0.0, louder: float = 1.0, joints: int = 1) ->
     for m, r in zip(motion, rest, strict=True):
         r[:, 0] += size * level * friction(m) / np.std(friction(m))
     rest[2] = louder * rest[2]
-    return Rows(tuple(motion[:2]), tuple(rest[:2])), Rows((motion[2],), (rest[2],))
+    return ComparedRows(tuple(motion[:2]), tuple(rest[:2])), ComparedRows((motion[2],), (rest[2],))
 
 
 @pytest.mark.parametrize("louder", [1.0, 3.0])
@@ -83,9 +85,9 @@ def test_rows_that_are_not_compared_are_left_out():
     seen = on_others(rows, other, 0, SLOW)
     kept = other.residual[0].copy()
     kept[::3] = 0
-    fewer = on_others(rows, Rows(other.motion, (kept,)), 0, SLOW)
+    fewer = on_others(rows, ComparedRows(other.motion, (kept,)), 0, SLOW)
     assert 3 < fewer.deviations < seen.deviations
-    nothing = Rows(rows.motion, tuple(np.zeros_like(r) for r in rows.residual))
+    nothing = ComparedRows(rows.motion, tuple(np.zeros_like(r) for r in rows.residual))
     assert on_others(nothing, other, 0, SLOW).deviations == 0
     assert on_others(nothing, other, 0, SLOW).share == 0
 

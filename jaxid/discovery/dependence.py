@@ -28,8 +28,8 @@ _TREES, _LEAF = 50, 5
 _ROWS = 20_000
 
 
-class Rows(eqx.Module):
-    """The compared rows of recordings.
+class ComparedRows(eqx.Module):
+    """Motion and residual at the compared rows of recordings.
 
     - `motion`: position, velocity, acceleration and direction of every joint, by recording.
     - `residual`: by recording, N·m or N (rad or m if positions are compared); zero at rows that are
@@ -40,7 +40,7 @@ class Rows(eqx.Module):
     residual: tuple[Float[np.ndarray, "_rows joints"], ...]
 
     @classmethod
-    def of_fit(cls, fit: Fit, diagnosis: Diagnosis) -> "Rows":
+    def of_fit(cls, fit: Fit, diagnosis: Diagnosis) -> "ComparedRows":
         """The rows of the fitted recordings, or of their windows.
 
         **Arguments:**
@@ -52,7 +52,7 @@ class Rows(eqx.Module):
         return cls(tuple(x[there] for x, there in zip(signals, mask, strict=True)), fit.residuals)
 
     @classmethod
-    def of_comparison(cls, held_out: Comparison) -> "Rows":
+    def of_comparison(cls, held_out: Comparison) -> "ComparedRows":
         """The rows of held-out recordings."""
         runs = [held_out.compared_motion(k) for k in range(len(held_out.recordings))]
         return cls(tuple(_signals(*run) for run in runs), held_out.residuals)
@@ -63,9 +63,11 @@ class Rows(eqx.Module):
         own = [joint + k * joints for k in range(_SIGNALS)]
         return [own, list(range(_SIGNALS * joints))][: min(joints, 2)]
 
-    def only(self, which: Sequence[int]) -> "Rows":
+    def only(self, which: Sequence[int]) -> "ComparedRows":
         """The rows of some of the recordings, by number."""
-        return Rows(tuple(self.motion[k] for k in which), tuple(self.residual[k] for k in which))
+        return ComparedRows(
+            tuple(self.motion[k] for k in which), tuple(self.residual[k] for k in which)
+        )
 
 
 def _signals(*motion: Float[np.ndarray, "*rows joints"]) -> Float[np.ndarray, "*rows signals"]:
@@ -114,7 +116,9 @@ class Dependence(eqx.Module):
         return cls(share, float(np.sqrt(count)) * alike(*white))
 
 
-def on_others(trained: Rows, others: Rows, joint: int, filt: ARFilter) -> Dependence:
+def on_others(
+    trained: ComparedRows, others: ComparedRows, joint: int, filt: ARFilter
+) -> Dependence:
     """The dependence of the residual of some recordings, with regressions trained on others.
 
     One regression is on the motion of the joint, one on that of all joints. The result is that of
@@ -132,7 +136,7 @@ def on_others(trained: Rows, others: Rows, joint: int, filt: ARFilter) -> Depend
     return max(found, key=lambda x: x.deviations)
 
 
-def among(rows: Rows, joint: int, filt: ARFilter) -> Dependence | None:
+def among(rows: ComparedRows, joint: int, filt: ARFilter) -> Dependence | None:
     """The dependence of the residual of each recording, with regressions trained on all others.
 
     None for a single recording.
@@ -153,7 +157,7 @@ def among(rows: Rows, joint: int, filt: ARFilter) -> Dependence | None:
 
 
 def _predicted(
-    trained: Rows, others: Rows, joint: int, used: Sequence[int]
+    trained: ComparedRows, others: ComparedRows, joint: int, used: Sequence[int]
 ) -> list[Float[np.ndarray, " _rows"]]:
     """The residual of one joint (from 0) on other recordings, as a regression predicts it.
 
@@ -194,8 +198,8 @@ def depends_on_motion(
       predicted from the others.
     - `worth`: smallest relevant change, in % of a joint's torque.
     """
-    rows = Rows.of_fit(fit, diagnosis)
-    others = None if held_out is None else Rows.of_comparison(held_out)
+    rows = ComparedRows.of_fit(fit, diagnosis)
+    others = None if held_out is None else ComparedRows.of_comparison(held_out)
     error = (fit if held_out is None else held_out).error_percent.to_numpy()
     reasons = []
     labels = joint_columns(fit.loop.joints)

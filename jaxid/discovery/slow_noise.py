@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from ..estimate import Fit
 from ..noise import ARFilter
 from .comparison import Comparison
-from .dependence import Rows, among, on_others
+from .dependence import ComparedRows, among, on_others
 from .diagnosis import Diagnosis, over_recordings
 from .explore import DECISIVE
 from .floor import Floor
@@ -48,8 +48,8 @@ def floor_with_slow_noise(
     high = above_floors(chosen, diagnosis, worth)
     if left.shape != diagnosis.floor.shape or not high.any():
         return measured
-    rows = Rows.of_fit(chosen, diagnosis)
-    unseen = None if held_out is None else Rows.of_comparison(held_out)
+    rows = ComparedRows.of_fit(chosen, diagnosis)
+    unseen = None if held_out is None else ComparedRows.of_comparison(held_out)
     low = np.minimum(diagnosis.floor, left)
     if measured is not None:
         low = np.where(np.isfinite(measured.low), np.minimum(measured.low, low), low)
@@ -75,7 +75,9 @@ def above_floors(chosen: Fit, diagnosis: Diagnosis, worth: float) -> Bool[np.nda
     return found
 
 
-def _independent(rows: Rows, unseen: Rows | None, joint: int, filt: ARFilter) -> bool:
+def _independent(
+    rows: ComparedRows, unseen: ComparedRows | None, joint: int, filt: ARFilter
+) -> bool:
     """Whether no regression predicts the residual of other recordings from their motion."""
     found = [among(rows, joint, filt)]
     if unseen is not None:
@@ -85,7 +87,7 @@ def _independent(rows: Rows, unseen: Rows | None, joint: int, filt: ARFilter) ->
 
 
 def _would_be_seen(
-    rows: Rows, diagnosis: Diagnosis, joint: int, filt: ARFilter, share: float
+    rows: ComparedRows, diagnosis: Diagnosis, joint: int, filt: ARFilter, share: float
 ) -> bool:
     """Whether the regression sees most functions of the motion as large as what is above the floor.
 
@@ -101,13 +103,15 @@ def _would_be_seen(
         changed = np.sqrt(1 - share) * rest
         changed[:, joint] += size * torque / np.linalg.norm(torque)
         changed[rest == 0] = 0
-        with_effect = Rows(rows.motion, tuple(np.split(changed, count)))
+        with_effect = ComparedRows(rows.motion, tuple(np.split(changed, count)))
         seen = among(with_effect, joint, filt)
         found.append(0.0 if seen is None else seen.deviations)
     return bool(found) and float(np.median(found)) > _SEEN
 
 
-def _torques(rows: Rows, diagnosis: Diagnosis, joint: int) -> Iterable[Float[np.ndarray, " rows"]]:
+def _torques(
+    rows: ComparedRows, diagnosis: Diagnosis, joint: int
+) -> Iterable[Float[np.ndarray, " rows"]]:
     """What the model cannot absorb of random functions of a joint's position and velocity.
 
     They are waves over the two, every second one with the sign of the velocity, as friction has it.
