@@ -15,6 +15,7 @@ from ..estimate.result import joint_columns
 from ..noise import ARFilter
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
+from .relevance import allowed
 
 # A residual depends on the motion above this number of deviations and this share of its power. The
 # share was at most 0.035 for right models, and at least 0.15 where a law outside the catalogue left
@@ -198,6 +199,7 @@ def depends_on_motion(
       predicted from the others.
     - `worth`: smallest relevant change, in % of a joint's torque.
     """
+    _, least = allowed(fit.loop, worth)
     rows = ComparedRows.of_fit(fit, diagnosis)
     others = None if held_out is None else ComparedRows.of_comparison(held_out)
     error = (fit if held_out is None else held_out).error_percent.to_numpy()
@@ -210,7 +212,7 @@ def depends_on_motion(
         if seen is None:
             continue
         part = float(percent * np.sqrt(seen.share))
-        if seen.deviations > _SURE and seen.share > _SHARE and part > worth:
+        if seen.deviations > _SURE and seen.share > _SHARE and part > least:
             where = "fitted" if others is None else "held-out"
             said = (
                 f"on the {where} recordings the error of {label} is {percent:.3g} %, of which a "

@@ -63,8 +63,10 @@ def floor_with_slow_noise(
 
 
 def above_floors(chosen: Fit, diagnosis: Diagnosis, worth: float) -> Bool[np.ndarray, " joints"]:
-    """Joints whose error is above the noise floor that was measured or of the model with all
-    effects."""
+    """Joints whose error is above the measured noise floor, or that of the model with all effects.
+
+    **Arguments:** as for `floor_with_slow_noise`.
+    """
     left, (limit, least) = chosen.error_percent.to_numpy(), allowed(chosen.loop, worth)
     rich = diagnosis.floor_percent() if diagnosis.unexplained >= DECISIVE else np.inf
     total = over_recordings(left)
@@ -101,7 +103,7 @@ def _would_be_seen(
     for torque in _torques(rows, diagnosis, joint):
         size = np.sqrt(share * np.sum(rest[:, joint] ** 2))
         changed = np.sqrt(1 - share) * rest
-        changed[:, joint] += size * torque / np.linalg.norm(torque)
+        changed[:, joint] += size * torque / max(np.linalg.norm(torque), 1e-300)
         changed[rest == 0] = 0
         with_effect = ComparedRows(rows.motion, tuple(np.split(changed, count)))
         seen = among(with_effect, joint, filt)
@@ -119,11 +121,11 @@ def _torques(
     data, rng = diagnosis.data, np.random.default_rng(0)
     joints = data.residual.shape[2]
     motion = np.concatenate(rows.motion)
-    q, v = motion[:, joint], motion[:, joints + joint]
+    q, v = (motion[:, k] / (np.std(motion[:, k]) or 1.0) for k in (joint, joints + joint))
     basis = spanned(data.base[data.mask].reshape(-1, data.base.shape[-1]))
     for number in range(_TRIED):
         waves, phase = rng.normal(size=2) * _WAVES, rng.uniform(0, 2 * np.pi)
-        torque = np.cos(waves[0] * q / np.std(q) + waves[1] * v / np.std(v) + phase)
+        torque = np.cos(waves[0] * q + waves[1] * v + phase)
         whole = np.zeros((len(q), joints))
         whole[:, joint] = torque * (np.sign(v) if number % 2 else 1.0)
         left = whole.reshape(-1)

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import re
+import shlex
 from collections.abc import Collection, Sequence
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from ..errors import brief, near
 from ._checks import numeric
 from ._description import Columns, Description
 from ._joints import by_joint
+from ._likely import likely_columns
 from ._problem import problem
 from ._streams import aligned
 from ._table import Table
@@ -258,8 +260,13 @@ def missing(source: str, table: Table, signal: str, name: str, beside: str = "")
             f"{what}, the file contains only {brief(struct)}, a {kind}",
             "save plain arrays of numbers, in MATLAB by save(file, '-struct', 's')",
         )
+    likely = likely_columns(table.columns)
+    if signal not in likely:
+        likely = {signal: ["..."]}
+    told = [f"{of}={','.join(those)}" for of, those in likely.items()]
+    options = " ".join(f"--column {shlex.quote(one)}" for one in told)
     return problem(
         source,
         f"{what}, there are {brief(list(table.columns))}",
-        f"rename it, or name its column: columns={{'{signal}': ...}}, --column {signal}=...",
+        f"rename it, or name its column: columns={{'{signal}': ...}}, or {options}",
     )
