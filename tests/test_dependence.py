@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import signal
 
 import jaxid
 from jaxid.control import Tracking
@@ -92,13 +93,16 @@ def test_rows_that_are_not_compared_are_left_out():
     assert on_others(nothing, other, 0, SLOW).share == 0
 
 
-def recorded(name: str, seed: int, missing: float = 0.0, drift: float = 0.0) -> jaxid.Recording:
+def recorded(
+    name: str, seed: int, missing: float = 0.0, drift: float = 0.0, ringing: float = 0.0
+) -> jaxid.Recording:
     """A slide with dry friction in closed form, 20 s at 200 Hz, its torque with noise.
 
     **Arguments:**
 
     - `missing`: size of a friction force that depends on position and velocity, N.
     - `drift`: standard deviation of a slow random walk after a second, N.
+    - `ringing`: standard deviation of noise around 8 Hz, N.
     """
     rng = np.random.default_rng(seed)
     time = np.arange(4000) / 200
@@ -111,6 +115,8 @@ def recorded(name: str, seed: int, missing: float = 0.0, drift: float = 0.0) -> 
     tau = 2.0 * a + 0.8 * v + 1.5 * np.tanh(v / 0.005)
     tau += missing * np.sign(v) * np.sin(25 * q) * np.tanh((v / 0.15) ** 2)
     tau += 0.02 * rng.standard_normal(len(time))
+    around = signal.butter(2, (7.0, 9.0), "bandpass", fs=200, output="sos")
+    tau += ringing * signal.sosfilt(around, rng.standard_normal(len(time))) * 7
     tau += drift * np.cumsum(rng.standard_normal(len(time))) / np.sqrt(200)
     return jaxid.Recording.from_arrays(time, q[:, None], tau[:, None], name=name)
 
@@ -154,6 +160,13 @@ def test_the_floor_of_torque_that_drifts_is_its_error(drifting):
 
 def test_a_missing_effect_is_not_slow_noise(lacking):
     fit, diagnosis, held_out = lacking
+    assert above_floors(fit, diagnosis, WORTH).all()
+    after = floor_with_slow_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
+    assert after is diagnosis.measured
+
+
+def test_what_rings_above_the_motion_is_not_slow_noise():
+    fit, diagnosis, held_out = diagnosed(ringing=0.1)
     assert above_floors(fit, diagnosis, WORTH).all()
     after = floor_with_slow_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
     assert after is diagnosis.measured

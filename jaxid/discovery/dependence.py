@@ -217,8 +217,7 @@ def depends_on_motion(
             said = (
                 f"on the {where} recordings the error of {label} is {percent:.3g} %, of which a "
                 f"regression on the motion, trained on other recordings, predicts {part:.3g} %: an "
-                "effect is missing that neither the catalogue nor a curve of one coordinate "
-                "describes"
+                "effect is missing that no examined model describes"
             )
             reasons.append((seen.share, said))
     return max(reasons, default=(0.0, ""))[1]

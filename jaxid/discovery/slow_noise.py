@@ -23,6 +23,9 @@ from .score import spanned
 # A residual below the first number of deviations does not depend on the motion. At least half of
 # the functions of the motion that are tried must be above the second one.
 _NONE, _SEEN = 3.0, 6.0
+# Share of the power above white noise that slow noise has at the frequencies of the joint's speed,
+# and share of the speed's power that defines these frequencies. A resonance is above them.
+_SLOW, _SPEED = 0.5, 0.9
 # Number of functions of the motion for which this is tried, and standard deviation of their wave
 # numbers, in radians over the standard deviation of position and velocity.
 _TRIED, _WAVES = 8, 1.5
@@ -56,8 +59,10 @@ def floor_with_slow_noise(
     slow = np.zeros(len(high), bool)
     for j in np.flatnonzero(high).tolist():
         free = 1 - min(float(over_recordings(low)[j] / over_recordings(left)[j]), 1.0) ** 2
-        slow[j] = _independent(rows, unseen, j, noise[j]) and _would_be_seen(
-            rows, diagnosis, j, noise[j], free
+        slow[j] = (
+            _is_slow(rows, j)
+            and _independent(rows, unseen, j, noise[j])
+            and _would_be_seen(rows, diagnosis, j, noise[j], free)
         )
     return _raised(measured, left, low, slow)
 
@@ -75,6 +80,23 @@ def above_floors(chosen: Fit, diagnosis: Diagnosis, worth: float) -> Bool[np.nda
         floor = np.where(np.isfinite(diagnosis.measured.high), diagnosis.measured.high, np.inf)
         found |= np.any((left > limit * floor) & (left**2 - floor**2 > least**2), axis=0)
     return found
+
+
+def _is_slow(rows: ComparedRows, joint: int) -> bool:
+    """Whether the residual's power above white noise is at the frequencies of the joint's speed."""
+    joints, slow, total = rows.residual[0].shape[1], 0.0, 0.0
+    for motion, residual in zip(rows.motion, rows.residual, strict=True):
+        window = np.hanning(len(residual))
+        rest, speed = (
+            np.abs(np.fft.rfft(x * window)) ** 2
+            for x in (residual[:, joint], motion[:, joints + joint])
+        )
+        # The power of a line of white noise is 1 / log(2) times the median.
+        white = np.median(rest[len(rest) // 2 :]) / np.log(2)
+        above = np.maximum(rest - white, 0.0)
+        last = int(np.searchsorted(np.cumsum(speed), _SPEED * np.sum(speed)))
+        slow, total = slow + float(np.sum(above[: last + 1])), total + float(np.sum(above))
+    return slow > _SLOW * total
 
 
 def _independent(
