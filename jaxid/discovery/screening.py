@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float
 
 from ..display.progress import working
 from ..effects import AbstractEffect, AbstractTransmission, Scene
@@ -132,7 +133,7 @@ def offered(
     """
     loop, motion = system.loop, system.linear.motion
     time = np.asarray(at_rows(system.batch, motion.t))
-    tones, trials = _tones(system.residual, system.mask, row_period(time, system.mask))
+    tones, trials = tones_of(system.residual, system.mask, time)
     scene = survey(loop, recordings, motion, tones)
     parted = {e.joint for e in loop.effects if isinstance(e, AbstractTransmission)}
     proposed = [
@@ -185,20 +186,29 @@ def _check_finite(
         )
 
 
-def _tones(
-    residual: np.ndarray, mask: np.ndarray, period: float, most: int = 4
+def tones_of(
+    residual: Float[np.ndarray, "recordings rows joints"],
+    mask: Bool[np.ndarray, "recordings rows"],
+    time: Float[np.ndarray, "recordings rows"],
+    most: int = 4,
 ) -> tuple[list[list[float]], float]:
-    """Peak frequencies of each joint's spectrum, and the number of candidate frequencies."""
-    n = residual.shape[1]
+    """Peak frequencies of each joint's spectrum, and the number of candidate frequencies.
+
+    **Arguments:**
+
+    - `mask`: rows that are not padding. `time`: of the rows, s; uneven if samples are missing.
+    - `most`: number of peaks of each joint.
+    """
+    period = row_period(time, mask)
+    even = [_evened(*row, period) for row in zip(time, residual, mask, strict=True)]
+    n = max(map(len, even))
     f = np.fft.rfftfreq(4 * n, period)
     usable = (f > 2 / (n * period)) & (f < 0.4 / period)
     found = []
     for j in range(residual.shape[2]):
         power = np.zeros(len(f))
-        for row, there in zip(residual[..., j], mask, strict=True):
-            window = np.zeros(n)
-            window[there] = np.hanning(int(there.sum()))
-            power += np.abs(np.fft.rfft(row * window, 4 * n)) ** 2
+        for rows in even:
+            power += np.abs(np.fft.rfft(rows[:, j] * np.hanning(len(rows)), 4 * n)) ** 2
         # Relative to the level around it, so that coloured noise does not give all the peaks.
         width = max(9, n // 20)
         around = np.exp(np.convolve(np.log(power + 1e-300), np.ones(width) / width, mode="same"))
@@ -210,3 +220,15 @@ def _tones(
             stands[np.abs(f - f[k]) < 2 / (n * period)] = 0.0
         found.append(row)
     return found, float(usable.sum() / 4 * residual.shape[2])
+
+
+def _evened(
+    time: Float[np.ndarray, " rows"],
+    residual: Float[np.ndarray, "rows joints"],
+    there: Bool[np.ndarray, " rows"],
+    period: float,
+) -> Float[np.ndarray, "even joints"]:
+    """A residual at evenly spaced times; a tone would change its phase at missing samples."""
+    own = time[there]
+    at = own[0] + period * np.arange(round((own[-1] - own[0]) / period) + 1)
+    return np.stack([np.interp(at, own, rows) for rows in residual[there].T], axis=1)
