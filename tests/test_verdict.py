@@ -11,6 +11,8 @@ from stories import recordings_of
 
 import jaxid
 from jaxid.control import Sampled
+from jaxid.discovery import verdict
+from jaxid.discovery.floor import Floor
 from jaxid.discovery.models import Model
 from jaxid.discovery.remarks import looks_sampled
 from jaxid.discovery.undecided import undecided
@@ -297,3 +299,22 @@ def test_an_effect_that_is_there_twice_is_chosen_twice(found, monkeypatch):
     )
     dataclasses.replace(found, considered=table).choose(1)
     assert asked == [other]
+
+
+def test_the_held_out_floor_leaves_out_joints_with_slow_noise_and_names_the_others(found):
+    after = found.steps[-1].held_out
+    left = after.error_percent.to_numpy()
+    sources = (("above the motion",) * 2,) * len(left)
+    floor = Floor(0.2 * left, 0.1 * left, 0.3 * left, sources)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(verdict, "floor_of", lambda *_: floor)
+        slow = dataclasses.replace(
+            floor, sources=(("unpredicted", "above the motion"),) * len(left)
+        )
+        kept = verdict._floor_of_unseen(found.fit, slow, after)
+    assert "the error of joint 1" in verdict._above_measured(
+        after, dataclasses.replace(floor, percent=0.2 * left * [0.5, 1.0]), WORTH
+    )
+    said = verdict._above_measured(after, kept, WORTH)
+    assert "the error of joint 2" in said
+    assert "nan" not in said

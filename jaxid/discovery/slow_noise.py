@@ -15,10 +15,9 @@ from ..noise import ARFilter
 from .comparison import Comparison
 from .dependence import ComparedRows, among, on_others
 from .diagnosis import Diagnosis, over_recordings
-from .explore import DECISIVE
 from .floor import Floor
-from .relevance import allowed
 from .score import spanned
+from .verdict import over_measured, over_rich
 
 # A residual below the first number of deviations does not depend on the motion. At least half of
 # the functions of the motion that are tried must be above the second one.
@@ -48,8 +47,10 @@ def floor_with_slow_noise(
     - `worth`: smallest relevant change, in % of a joint's torque.
     """
     left, measured = chosen.error_percent.to_numpy(), diagnosis.measured
+    if left.shape != diagnosis.floor.shape:
+        return measured
     high = above_floors(chosen, diagnosis, worth)
-    if left.shape != diagnosis.floor.shape or not high.any():
+    if not high.any():
         return measured
     rows = ComparedRows.of_fit(chosen, diagnosis)
     unseen = None if held_out is None else ComparedRows.of_comparison(held_out)
@@ -72,14 +73,8 @@ def above_floors(chosen: Fit, diagnosis: Diagnosis, worth: float) -> Bool[np.nda
 
     **Arguments:** as for `floor_with_slow_noise`.
     """
-    left, (limit, least) = chosen.error_percent.to_numpy(), allowed(chosen.loop, worth)
-    rich = diagnosis.floor_percent() if diagnosis.unexplained >= DECISIVE else np.inf
-    total = over_recordings(left)
-    found = (total > limit * rich) & (total**2 - rich**2 > least**2)
-    if diagnosis.measured is not None:
-        floor = np.where(np.isfinite(diagnosis.measured.high), diagnosis.measured.high, np.inf)
-        found |= np.any((left > limit * floor) & (left**2 - floor**2 > least**2), axis=0)
-    return found
+    measured = over_measured(chosen, diagnosis.measured, worth)
+    return (over_rich(chosen, diagnosis, worth) > 0) | np.any(measured > 0, axis=0)
 
 
 def _is_slow(rows: ComparedRows, joint: int) -> bool:

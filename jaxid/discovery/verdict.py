@@ -126,7 +126,10 @@ def _floor_of_unseen(fit: Fit, measured: Floor | None, unseen: Comparison) -> Fl
     floor = floor_of(unseen.loop, unseen.recordings, fit.recordings)
     if floor is None or measured is None:
         return floor
-    return dataclasses.replace(floor, percent=np.where(measured.slow, np.nan, floor.percent))
+    percent, low, high = (
+        np.where(measured.slow, np.nan, x) for x in (floor.percent, floor.low, floor.high)
+    )
+    return dataclasses.replace(floor, percent=percent, low=low, high=high)
 
 
 def explains_little(fit: Fit, noise: Sequence[ARFilter], measured: Floor | None) -> str:
@@ -190,39 +193,62 @@ def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
     return ""
 
 
-def _above_floor(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
-    """The reason if only many effects together explain the residual."""
-    if diagnosis.unexplained < DECISIVE:
-        return ""
+def over_rich(
+    fit: Fit | Comparison, diagnosis: Diagnosis, worth: float
+) -> Float[np.ndarray, " joints"]:
+    """Errors over the noise floor where only many effects together explain more, otherwise zero.
+
+    **Arguments:** as for `refuted`.
+    """
     left = over_recordings(fit.error_percent.to_numpy())
+    if diagnosis.unexplained < DECISIVE:
+        return np.zeros(len(left))
     by_noise = diagnosis.floor_percent()
     limit, least = allowed(fit.loop, worth)
     ratio = np.where(left**2 - by_noise**2 > least**2, left / np.maximum(by_noise, 1e-12), 0.0)
-    worst = int(np.argmax(ratio))
-    if not ratio[worst] > limit:
+    return np.where(ratio > limit, ratio, 0.0)
+
+
+def over_measured(
+    fit: Fit | Comparison, floor: Floor | None, worth: float
+) -> Float[np.ndarray, "recordings joints"]:
+    """Errors over the noise floor measured without a model where they exceed it, otherwise zero.
+
+    **Arguments:** as for `refuted`; `floor` is that of the recordings of the fit.
+    """
+    left = fit.error_percent.to_numpy()
+    if floor is None:
+        return np.zeros(left.shape)
+    limit, least = allowed(fit.loop, worth)
+    matters = left**2 - np.nan_to_num(floor.percent) ** 2 > least**2
+    ratio = np.where(matters & (left > limit * floor.high), left / floor.percent, 0.0)
+    return np.where(ratio > limit, ratio, 0.0)
+
+
+def _above_floor(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
+    """The reason if only many effects together explain the residual."""
+    ratio = over_rich(fit, diagnosis, worth)
+    if not np.any(ratio):
         return ""
-    label = joint_columns(fit.loop.joints)[worst]
+    worst = int(np.argmax(ratio))
+    left = over_recordings(fit.error_percent.to_numpy())[worst]
     return (
-        f"on the fitted recordings the error of {label} is {left[worst]:.3g} %, and the noise "
-        f"floor {by_noise[worst]:.3g} %: neither the catalogue nor a curve of one coordinate "
-        "explains the difference"
+        f"on the fitted recordings the error of {joint_columns(fit.loop.joints)[worst]} is "
+        f"{left:.3g} %, and the noise floor {diagnosis.floor_percent()[worst]:.3g} %: neither the "
+        "catalogue nor a curve of one coordinate explains the difference"
     )
 
 
 def _above_measured(fit: Fit | Comparison, floor: Floor | None, worth: float) -> str:
     """The reason if the error of a joint is above the noise floor measured without a model."""
-    if floor is None:
-        return ""
-    left = fit.error_percent.to_numpy()
-    limit, least = allowed(fit.loop, worth)
-    matters = left**2 - np.nan_to_num(floor.percent) ** 2 > least**2
-    ratio = np.where(matters & (left > limit * floor.high), left / floor.percent, 0.0)
-    if not np.any(ratio > limit):
+    ratio = over_measured(fit, floor, worth)
+    if floor is None or not np.any(ratio):
         return ""
     r, j = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+    left = fit.error_percent.to_numpy()[r, j]
     return (
         f"on {fit.recordings.names[r]} the error of {joint_columns(fit.loop.joints)[j]} is "
-        f"{left[r, j]:.3g} %, and the noise floor is {floor.low[r, j]:.3g} to "
+        f"{left:.3g} %, and the noise floor is {floor.low[r, j]:.3g} to "
         f"{floor.high[r, j]:.3g} % ({SPOKEN[floor.sources[r][j]]}): neither the catalogue nor "
         "a curve of one coordinate explains the difference"
     )
