@@ -15,18 +15,13 @@ from ..estimate.result import joint_columns
 from ..noise import ARFilter
 from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
+from .regressions import REGRESSIONS, AbstractRegression
 from .relevance import allowed
 
 # A residual depends on the motion above this number of deviations and this share of its power. In
 # benchmarks.worlds the share was at most 0.035 for right models without drifting noise, and above
 # 0.2 for models in place of a law outside the catalogue, at 1.5 and 2.8 times the noise floor.
 _SURE, _SHARE = 4.0, 0.1
-# Number of signals of the motion of a joint.
-_SIGNALS = 4
-# Trees of the regression, and smallest number of rows in a leaf.
-_TREES, _LEAF = 50, 5
-# Largest number of rows that the regression is trained on.
-_ROWS = 20_000
 
 
 class ComparedRows(eqx.Module):
@@ -37,7 +32,7 @@ class ComparedRows(eqx.Module):
       not compared.
     """
 
-    motion: tuple[Float[np.ndarray, "_rows signals"], ...]
+    motion: tuple[Float[np.ndarray, "_rows joints signals"], ...]
     residual: tuple[Float[np.ndarray, "_rows joints"], ...]
 
     @classmethod
@@ -59,10 +54,9 @@ class ComparedRows(eqx.Module):
         return cls(tuple(_signals(*run) for run in runs), held_out.residuals)
 
     def sets(self, joint: int) -> list[list[int]]:
-        """Columns of the motion of a joint (from 0), and of all joints if there are several."""
+        """The joint (from 0), and all joints if there are several."""
         joints = self.residual[0].shape[1]
-        own = [joint + k * joints for k in range(_SIGNALS)]
-        return [own, list(range(_SIGNALS * joints))][: min(joints, 2)]
+        return [[joint], list(range(joints))][: min(joints, 2)]
 
     def only(self, which: Sequence[int]) -> "ComparedRows":
         """The rows of some of the recordings, by number."""
@@ -71,9 +65,11 @@ class ComparedRows(eqx.Module):
         )
 
 
-def _signals(*motion: Float[np.ndarray, "*rows joints"]) -> Float[np.ndarray, "*rows signals"]:
+def _signals(
+    *motion: Float[np.ndarray, "*rows joints"],
+) -> Float[np.ndarray, "*rows joints signals"]:
     """Signals from position, velocity and acceleration; the direction is the sign of velocity."""
-    return np.concatenate([*motion, np.sign(motion[1])], axis=-1)
+    return np.stack([*motion, np.sign(motion[1])], axis=-1)
 
 
 class Dependence(eqx.Module):
@@ -82,10 +78,17 @@ class Dependence(eqx.Module):
     - `share`: part of the residual's power.
     - `deviations`: product of prediction and residual, both whitened, over its standard deviation
       if the residual is noise.
+    - `on`: what the prediction depends on.
     """
 
     share: float
     deviations: float
+    on: str = eqx.field(static=True, default="")
+
+    @property
+    def sure(self) -> bool:
+        """Whether the residual depends on the motion, by a part that counts."""
+        return self.deviations > _SURE and self.share > _SHARE
 
     @classmethod
     def of(
@@ -93,12 +96,15 @@ class Dependence(eqx.Module):
         predicted: Sequence[Float[np.ndarray, " _rows"]],
         residual: Sequence[Float[np.ndarray, " _rows"]],
         filt: ARFilter,
+        on: str,
+        twice: bool = False,
     ) -> "Dependence":
         """The agreement of a predicted and a residual series, by recording.
 
         **Arguments:**
 
-        - `filt`: noise filter of the residual.
+        - `filt`: noise filter of the residual. `on`: what the prediction depends on.
+        - `twice`: whether each recording has been predicted from the others.
         """
 
         def alike(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> float:
@@ -113,31 +119,43 @@ class Dependence(eqx.Module):
         # Their deviation is that of these recordings, where noise may be stronger than where the
         # filter was estimated.
         count = sum(map(np.count_nonzero, there))
+        # If two recordings predict each other, their two products may be equal.
+        independent = count / 2 if twice else count
         share = max(alike(predicted, residual), 0.0) ** 2
-        return cls(share, float(np.sqrt(count)) * alike(*white))
+        return cls(share, float(np.sqrt(independent)) * alike(*white), on)
 
 
 def on_others(
-    trained: ComparedRows, others: ComparedRows, joint: int, filt: ARFilter
+    trained: ComparedRows,
+    others: ComparedRows,
+    joint: int,
+    filt: ARFilter,
+    regressions: Sequence[AbstractRegression] = REGRESSIONS,
 ) -> Dependence:
     """The dependence of the residual of some recordings, with regressions trained on others.
 
-    One regression is on the motion of the joint, one on that of all joints. The result is that of
-    the better one.
+    Each regression is tried on the motion of the joint, and on that of all joints. The result is
+    that of the best one.
 
     **Arguments:**
 
     - `joint`: from 0. `filt`: noise filter of its residual.
     """
     rest = [r[:, joint] for r in others.residual]
-    found = [
-        Dependence.of(_predicted(trained, others, joint, used), rest, filt)
-        for used in trained.sets(joint)
-    ]
-    return max(found, key=lambda x: x.deviations)
+    found = []
+    for regression in regressions:
+        for used in trained.sets(joint):
+            predicted = _predicted(regression, trained, others, joint, used, filt)
+            found.append(Dependence.of(predicted, rest, filt, regression.on))
+    return _best(found)
 
 
-def among(rows: ComparedRows, joint: int, filt: ARFilter) -> Dependence | None:
+def among(
+    rows: ComparedRows,
+    joint: int,
+    filt: ARFilter,
+    regressions: Sequence[AbstractRegression] = REGRESSIONS,
+) -> Dependence | None:
     """The dependence of the residual of each recording, with regressions trained on all others.
 
     None for a single recording.
@@ -148,38 +166,39 @@ def among(rows: ComparedRows, joint: int, filt: ARFilter) -> Dependence | None:
     if len(every) < 2:
         return None
     rest, found = [r[:, joint] for r in rows.residual], []
-    for used in rows.sets(joint):
-        predicted = [
-            _predicted(rows.only([i for i in every if i != k]), rows.only([k]), joint, used)[0]
-            for k in every
-        ]
-        found.append(Dependence.of(predicted, rest, filt))
-    return max(found, key=lambda x: x.deviations)
+    for regression in regressions:
+        for used in rows.sets(joint):
+            predicted = []
+            for k in every:
+                others = rows.only([i for i in every if i != k])
+                predicted += _predicted(regression, others, rows.only([k]), joint, used, filt)
+            found.append(Dependence.of(predicted, rest, filt, regression.on, twice=True))
+    return _best(found)
+
+
+def _best(found: Sequence[Dependence]) -> Dependence:
+    """The one that is sure and predicts most; if none is sure, that with most deviations."""
+    return max(found, key=lambda x: (x.sure, x.share if x.sure else x.deviations))
 
 
 def _predicted(
-    trained: ComparedRows, others: ComparedRows, joint: int, used: Sequence[int]
+    regression: AbstractRegression,
+    trained: ComparedRows,
+    others: ComparedRows,
+    joint: int,
+    used: Sequence[int],
+    filt: ARFilter,
 ) -> list[Float[np.ndarray, " _rows"]]:
     """The residual of one joint (from 0) on other recordings, as a regression predicts it.
 
-    Randomised trees (Geurts, Ernst and Wehenkel 2006) describe steps of friction at reversals, and
-    do not extrapolate.
-
     **Arguments:**
 
-    - `used`: columns of the motion.
+    - `used`: joints of whose motion it is a function.
     """
-    from sklearn.ensemble import ExtraTreesRegressor
-
-    motion, rest = np.concatenate(trained.motion), np.concatenate(trained.residual)[:, joint]
-    there = np.flatnonzero(rest)
-    there = there[:: max(1, -(-len(there) // _ROWS))]
-    if len(there) <= _LEAF:
-        return [np.zeros(len(r)) for r in others.residual]
-    trees = ExtraTreesRegressor(_TREES, min_samples_leaf=_LEAF, random_state=0)
-    trees.fit(motion[there][:, used], rest[there])
-    pairs = zip(others.motion, others.residual, strict=True)
-    return [trees.predict(x[:, used]) * (r[:, joint] != 0) for x, r in pairs]
+    motion, elsewhere = ([x[:, used] for x in rows.motion] for rows in (trained, others))
+    residual = [r[:, joint] for r in trained.residual]
+    predicted = regression.predicted(motion, residual, elsewhere, filt)
+    return [x * (r[:, joint] != 0) for x, r in zip(predicted, others.residual, strict=True)]
 
 
 def depends_on_motion(
@@ -212,11 +231,11 @@ def depends_on_motion(
         if seen is None:
             continue
         part = float(percent * np.sqrt(seen.share))
-        if seen.deviations > _SURE and seen.share > _SHARE and part > least:
+        if seen.sure and part > least:
             where = "fitted" if others is None else "held-out"
             said = (
                 f"on the {where} recordings the error of {label} is {percent:.3g} %, of which a "
-                f"regression on the motion, trained on other recordings, predicts {part:.3g} %: an "
+                f"regression on {seen.on}, trained on other recordings, predicts {part:.3g} %: an "
                 "effect is missing that no examined model describes"
             )
             reasons.append((seen.share, said))

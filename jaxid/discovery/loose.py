@@ -11,18 +11,20 @@ from .examined import Examined
 from .explore import key_of
 from .models import Model, listed
 from .relevance import matches_curve
-from .verify import values_of
+from .verify import values_of, wald
 
 # Smallest distance of a determined value from zero, in deviations: a 95 % interval excludes zero.
-_DETERMINED = 2.0
+DETERMINED = 2.0
 
 
 def undetermined(found: Fit, added: int) -> tuple[AbstractEffect, ...]:
     """The effects, of those that a refit has added, of which the recordings determine no value.
 
-    A value is determined if it is at least two standard deviations from zero. If none is, the
-    effect is absent, or other parameters of the model can take its place. The deviations contain
-    the errors that noise of a recorded motion causes, which the score does not contain.
+    A value is determined if it is at least two standard deviations from zero. Values that can
+    replace each other, such as the coefficients of a Fourier series over a part of a turn, are
+    determined together if their Wald statistic has the same probability. If neither is, the effect
+    is absent, or other parameters of the model can take its place. The deviations contain the
+    errors that noise of a recorded motion causes, which the score does not contain.
 
     **Arguments:**
 
@@ -30,9 +32,22 @@ def undetermined(found: Fit, added: int) -> tuple[AbstractEffect, ...]:
     """
     effects = found.loop.effects
     last = range(len(effects) - added, len(effects))
-    values = {k: [place for place, _ in values_of(found.loop, k)] for k in last}
-    known = _DETERMINED * found.std < np.abs(found.theta)
-    return tuple(effects[k] for k, own in values.items() if own and not known[own].any())
+    values = {k: values_of(found.loop, k) for k in last}
+    return tuple(effects[k] for k, own in values.items() if own and not _determined(found, own))
+
+
+def _determined(fit: Fit, values: Sequence[tuple[int, bool]]) -> bool:
+    """Whether a value of an effect is determined, or those in which torque is linear together."""
+    from scipy.stats import chi2
+
+    own = [place for place, _ in values]
+    if (DETERMINED * fit.std[own] < np.abs(fit.theta)[own]).any():
+        return True
+    linear = [place for place, linear in values if linear and np.isfinite(fit.std[place])]
+    if len(linear) < 2:
+        return False
+    chance = chi2.sf(DETERMINED**2, 1)
+    return bool(chi2.sf(wald(fit, linear), len(linear)) < chance)
 
 
 def with_fewer(

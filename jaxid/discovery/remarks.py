@@ -15,6 +15,7 @@ from .alongside import LATE
 from .diagnosis import Diagnosis
 from .explore import DECISIVE
 from .hypotheses import amplitude_names, effect_on
+from .loose import DETERMINED
 from .models import named
 from .offsets import held_offsets
 from .step import Step, found_parameters
@@ -40,10 +41,6 @@ def remarks(
     return (*(said if bad else ()), *more)
 
 
-# Deviations of its value up to which it is not determined on its own.
-_VAGUE = 2.0
-
-
 def _uncertain(steps: Sequence[Step]) -> list[str]:
     """Notes on added effects that are certain although each of their values is uncertain."""
     loop = steps[-1].fit.loop
@@ -52,15 +49,21 @@ def _uncertain(steps: Sequence[Step]) -> list[str]:
     added = [step.added for step in steps if step.added is not None]
     for k, effect in enumerate(added):
         values = found_parameters(steps, k).values()
-        if any(x["std"] is not None and abs(x["value"]) > _VAGUE * x["std"] for x in values):
+        if any(x["std"] is not None and abs(x["value"]) > DETERMINED * x["std"] for x in values):
             continue
         joint = getattr(effect, "joint", None)
         free = [p.name for p in shapes if p.joint == joint and not p.declaration.linear]
+        label = effect_on(*named(effect))
         if joint is not None and free:
             found.append(
-                f"each value of {effect_on(*named(effect))} is uncertain, although the error is "
-                f"larger without it: its size and {joined(free)} can replace each other, and the "
-                f"recordings determine only the sum of the effects on joint {joint}"
+                f"each value of {label} is uncertain, although the error is larger without it: its "
+                f"size and {joined(free)} can replace each other, and the recordings determine "
+                f"only the sum of the effects on joint {joint}"
+            )
+        elif len(values) > 1:
+            found.append(
+                f"each value of {label} is uncertain, although together they are not zero: along "
+                "these recordings they can replace each other or other parameters"
             )
     return found
 

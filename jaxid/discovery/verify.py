@@ -28,6 +28,8 @@ _CERTAIN, _RESHAPED = 3.0, 10.0
 # Ratio of actual to predicted decrease of the score above which, or below whose inverse, the refit
 # is repeated from another start.
 _FAR = 2.0
+# Eigenvalues of correlations of estimates, relative to the largest, below which they are rounding.
+_SINGULAR = 1e-10
 # Ratio of a residual after the start to the later one above which the initial state is wrong.
 _APART = 3.0
 # Largest number of refits in which frictions take the estimated sign of their joint.
@@ -284,11 +286,13 @@ def wald(fit: Fit, places: Sequence[int]) -> float:
 
     It is the increase of the whitened squared error if these values are zero.
     """
-    covariance = fit.covariance[np.ix_(places, places)]
-    if not np.isfinite(covariance).all():
+    std, own = fit.std[list(places)], np.ix_(places, places)
+    if not np.isfinite(std).all():
         return 0.0
-    values = np.asarray(fit.theta)[list(places)]
-    return float(values @ np.linalg.pinv(covariance) @ values)
+    size = np.where(std > 0, std, 1.0)
+    values = np.asarray(fit.theta)[list(places)] / size
+    correlation = fit.covariance[own] / np.outer(size, size)
+    return float(values @ np.linalg.pinv(correlation, _SINGULAR, hermitian=True) @ values)
 
 
 def values_of(loop: ClosedLoop, place: int) -> list[tuple[int, bool]]:
