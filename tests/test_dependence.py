@@ -70,6 +70,32 @@ def test_deviations_of_slow_noise_are_standard(louder, regressions):
     assert np.max(found) < 3.5
 
 
+@pytest.mark.parametrize("regressions", [AT_ONCE, WITH_MEMORY])
+def test_errors_of_parameters_are_not_a_missing_effect(regressions):
+    """They come from the noise that the regression was trained on, so it predicts them."""
+    alone, beside = [], []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        motion = [motion_of(rng) for _ in range(3)]
+        # The held-out motion is ten times as fast as the fitted ones.
+        motion[2] *= np.array([1.0, 10.0, 100.0, 1.0])
+        rest = [SLOW.simulate((1, len(m)), rng).T for m in motion]
+        base = [m[:, :, 1:] for m in motion]
+        x, y = np.concatenate(base[:2])[:, 0], np.concatenate(rest[:2])[:, 0]
+        errors = np.linalg.lstsq(x, y, rcond=None)[0]
+        rest = [r - b @ errors for r, b in zip(rest, base, strict=True)]
+        rows = ComparedRows(tuple(motion[:2]), tuple(rest[:2]))
+        other = ComparedRows((motion[2],), (rest[2],))
+        alone.append(on_others(rows, other, 0, SLOW, regressions).deviations)
+        known = dataclasses.replace(other, base=(base[2],))
+        beside.append(on_others(rows, known, 0, SLOW, regressions).deviations)
+    if regressions == WITH_MEMORY:
+        assert np.median(alone) > 4
+    # The standard deviation of twenty draws is known to a sixth.
+    assert np.std(beside) == pytest.approx(1.0, abs=0.4)
+    assert np.max(beside) < 3.5
+
+
 def test_a_function_of_the_motion_is_seen_in_a_recording_that_it_was_not_trained_on():
     for seed in range(5):
         rows, other = drawn(seed, size=1.0)

@@ -4,7 +4,7 @@ Scores and noise filters cannot tell slow noise from the torque of a missing eff
 of a recording is not a function of the motion of another one, and the torque of most effects is.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -17,6 +17,8 @@ from .comparison import Comparison
 from .diagnosis import Diagnosis, over_recordings
 from .regressions import REGRESSIONS, AbstractRegression
 from .relevance import allowed
+from .score import spanned
+from .system import System
 
 # A residual depends on the motion above this number of deviations and this share of its power. In
 # benchmarks.worlds the share was at most 0.035 for right models without drifting noise, and above
@@ -30,10 +32,12 @@ class ComparedRows(eqx.Module):
     - `motion`: position, velocity, acceleration and direction of every joint, by recording.
     - `residual`: by recording, N·m or N (rad or m if positions are compared); zero at rows that are
       not compared.
+    - `base`: by recording, what the model's parameters can change; None if it is not known.
     """
 
     motion: tuple[Float[np.ndarray, "_rows joints signals"], ...]
     residual: tuple[Float[np.ndarray, "_rows joints"], ...]
+    base: tuple[Float[np.ndarray, "_rows joints absorbed"], ...] | None = None
 
     @classmethod
     def of_fit(cls, fit: Fit, diagnosis: Diagnosis) -> "ComparedRows":
@@ -43,15 +47,31 @@ class ComparedRows(eqx.Module):
 
         - `diagnosis`: of this fit, or of one of the same model with other values.
         """
-        motion, mask = diagnosis.motion, diagnosis.data.mask
+        motion, data = diagnosis.motion, diagnosis.data
         signals = _signals(*(np.asarray(x) for x in (motion.q, motion.v, motion.a)))
-        return cls(tuple(x[there] for x, there in zip(signals, mask, strict=True)), fit.residuals)
+        moved, base = (
+            tuple(x[there] for x, there in zip(rows, data.mask, strict=True))
+            for rows in (signals, data.base)
+        )
+        return cls(moved, fit.residuals, base)
 
     @classmethod
     def of_comparison(cls, held_out: Comparison) -> "ComparedRows":
         """The rows of held-out recordings."""
         runs = [held_out.compared_motion(k) for k in range(len(held_out.recordings))]
         return cls(tuple(_signals(*run) for run in runs), held_out.residuals)
+
+    def with_base(self, compared: Comparison) -> "ComparedRows":
+        """The rows of held-out recordings, with what the model's parameters can change.
+
+        This linearises the model along the recordings. Windows have rows of their own, for which it
+        remains unknown.
+        """
+        system = System.of(compared)
+        base = tuple(x[there] for x, there in zip(system.base, system.mask, strict=True))
+        if [len(x) for x in base] != [len(r) for r in self.residual]:
+            return self
+        return ComparedRows(self.motion, self.residual, base)
 
     def sets(self, joint: int) -> list[list[int]]:
         """The joint (from 0), and all joints if there are several."""
@@ -60,9 +80,17 @@ class ComparedRows(eqx.Module):
 
     def only(self, which: Sequence[int]) -> "ComparedRows":
         """The rows of some of the recordings, by number."""
-        return ComparedRows(
-            tuple(self.motion[k] for k in which), tuple(self.residual[k] for k in which)
-        )
+
+        def chosen(rows: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+            return tuple(rows[k] for k in which)
+
+        base = None if self.base is None else chosen(self.base)
+        return ComparedRows(chosen(self.motion), chosen(self.residual), base)
+
+    def of_joint(self, joint: int) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
+        """Residual and base of one joint (from 0), by recording."""
+        base = None if self.base is None else [x[:, joint] for x in self.base]
+        return [r[:, joint] for r in self.residual], base
 
 
 def _signals(
@@ -97,6 +125,8 @@ class Dependence(eqx.Module):
         residual: Sequence[Float[np.ndarray, " _rows"]],
         filt: ARFilter,
         on: str,
+        *,
+        base: Sequence[Float[np.ndarray, "_rows absorbed"]] | None = None,
         twice: bool = False,
     ) -> "Dependence":
         """The agreement of a predicted and a residual series, by recording.
@@ -104,25 +134,29 @@ class Dependence(eqx.Module):
         **Arguments:**
 
         - `filt`: noise filter of the residual. `on`: what the prediction depends on.
+        - `base`: what the model's parameters can change. Their errors, which come from the noise
+          that the regression was trained on, are then not taken for a missing effect.
         - `twice`: whether each recording has been predicted from the others.
         """
+        there = [r != 0 for r in residual]
 
-        def alike(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> float:
-            x, y = np.concatenate(one), np.concatenate(other)
+        def agreement(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> float:
+            def rows(series: Sequence[np.ndarray]) -> np.ndarray:
+                return np.concatenate([change(x, k) for x, k in zip(series, there, strict=True)])
+
+            x, y = rows(predicted), rows(residual)
+            if base is not None:
+                absorbed = spanned(rows(base))
+                x, y = (z - absorbed @ (absorbed.T @ z) for z in (x, y))
             return float(x @ y / max(np.linalg.norm(x) * np.linalg.norm(y), 1e-300))
 
-        there = [r != 0 for r in residual]
-        white = [
-            [filt.innovations(x, kept) for x, kept in zip(series, there, strict=True)]
-            for series in (predicted, residual)
-        ]
-        # Their deviation is that of these recordings, where noise may be stronger than where the
+        # The deviation is that of these recordings, where noise may be stronger than where the
         # filter was estimated.
         count = sum(map(np.count_nonzero, there))
         # If two recordings predict each other, their two products may be equal.
         independent = count / 2 if twice else count
-        share = max(alike(predicted, residual), 0.0) ** 2
-        return cls(share, float(np.sqrt(independent)) * alike(*white), on)
+        share = max(agreement(lambda x, kept: (x.T * kept).T), 0.0) ** 2
+        return cls(share, float(np.sqrt(independent)) * agreement(filt.innovations), on)
 
 
 def on_others(
@@ -141,12 +175,12 @@ def on_others(
 
     - `joint`: from 0. `filt`: noise filter of its residual.
     """
-    rest = [r[:, joint] for r in others.residual]
+    rest, base = others.of_joint(joint)
     found = []
     for regression in regressions:
         for used in trained.sets(joint):
             predicted = _predicted(regression, trained, others, joint, used, filt)
-            found.append(Dependence.of(predicted, rest, filt, regression.on))
+            found.append(Dependence.of(predicted, rest, filt, regression.on, base=base))
     return _best(found)
 
 
@@ -165,14 +199,14 @@ def among(
     every = range(len(rows.residual))
     if len(every) < 2:
         return None
-    rest, found = [r[:, joint] for r in rows.residual], []
+    (rest, base), found = rows.of_joint(joint), []
     for regression in regressions:
         for used in rows.sets(joint):
             predicted = []
             for k in every:
                 others = rows.only([i for i in every if i != k])
                 predicted += _predicted(regression, others, rows.only([k]), joint, used, filt)
-            found.append(Dependence.of(predicted, rest, filt, regression.on, twice=True))
+            found.append(Dependence.of(predicted, rest, filt, regression.on, base=base, twice=True))
     return _best(found)
 
 
@@ -221,22 +255,27 @@ def depends_on_motion(
     _, least = allowed(fit.loop, worth)
     rows = ComparedRows.of_fit(fit, diagnosis)
     others = None if held_out is None else ComparedRows.of_comparison(held_out)
-    error = (fit if held_out is None else held_out).error_percent.to_numpy()
-    reasons = []
-    labels = joint_columns(fit.loop.joints)
-    for j, (label, percent, filt) in enumerate(
-        zip(labels, over_recordings(error), noise, strict=True)
-    ):
-        seen = among(rows, j, filt) if others is None else on_others(rows, others, j, filt)
-        if seen is None:
-            continue
-        part = float(percent * np.sqrt(seen.share))
-        if seen.sure and part > least:
-            where = "fitted" if others is None else "held-out"
-            said = (
-                f"on the {where} recordings the error of {label} is {percent:.3g} %, of which a "
-                f"regression on {seen.on}, trained on other recordings, predicts {part:.3g} %: an "
-                "effect is missing that no examined model describes"
-            )
-            reasons.append((seen.share, said))
-    return max(reasons, default=(0.0, ""))[1]
+    error = over_recordings((fit if held_out is None else held_out).error_percent.to_numpy())
+
+    def seen(j: int) -> Dependence | None:
+        return among(rows, j, noise[j]) if others is None else on_others(rows, others, j, noise[j])
+
+    def sure(joints: Iterable[int]) -> dict[int, tuple[float, Dependence]]:
+        found = ((j, seen(j)) for j in joints)
+        parts = {j: (float(error[j] * np.sqrt(x.share)), x) for j, x in found if x and x.sure}
+        return {j: pair for j, pair in parts.items() if pair[0] > least}
+
+    reasons = sure(range(fit.loop.joints))
+    if reasons and held_out is not None and others is not None:
+        # The linearisation along the held-out runs compiles a program, so it is made only now.
+        others = others.with_base(held_out)
+        reasons = sure(reasons)
+    if not reasons:
+        return ""
+    j, (part, found) = max(reasons.items(), key=lambda item: item[1][1].share)
+    where = "fitted" if others is None else "held-out"
+    return (
+        f"on the {where} recordings the error of {joint_columns(fit.loop.joints)[j]} is "
+        f"{error[j]:.3g} %, of which a regression on {found.on}, trained on other recordings, "
+        f"predicts {part:.3g} %: an effect is missing that no examined model describes"
+    )

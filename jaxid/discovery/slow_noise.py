@@ -129,7 +129,7 @@ def _would_be_seen(
         changed = np.sqrt(1 - share) * rest
         changed[:, joint] += size * torque / max(np.linalg.norm(torque), 1e-300)
         changed[rest == 0] = 0
-        with_effect = ComparedRows(rows.motion, tuple(np.split(changed, count)))
+        with_effect = ComparedRows(rows.motion, tuple(np.split(changed, count)), rows.base)
         seen = among(with_effect, joint, filt, AT_ONCE)
         found.append(0.0 if seen is None else seen.deviations)
     return bool(found) and float(np.median(found)) > _SEEN
