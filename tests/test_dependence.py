@@ -55,11 +55,11 @@ def drawn(
 
 
 @pytest.mark.parametrize("regressions", [AT_ONCE, WITH_MEMORY])
-@pytest.mark.parametrize("louder", [1.0, 3.0])
-def test_deviations_of_slow_noise_are_standard(louder, regressions):
+def test_deviations_of_slow_noise_are_standard(regressions):
     found = []
     for seed in range(40):
-        rows, other = drawn(seed, louder=louder)
+        # Noise of the other recording is stronger than where the filter was estimated.
+        rows, other = drawn(seed, louder=3.0)
         both = among(rows, 0, SLOW, regressions), on_others(rows, other, 0, SLOW, regressions)
         found.append([x.deviations for x in both])
     # The standard deviation of forty draws is known to a ninth.

@@ -1,10 +1,10 @@
-"""Whether a residual depends on the motion: a regression is tested on recordings it has not seen.
+"""Whether a residual depends on the motion: regressions are tested on recordings not seen before.
 
 Scores and noise filters cannot tell slow noise from the torque of a missing effect. But the noise
 of a recording is not a function of the motion of another one, and the torque of most effects is.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -252,30 +252,42 @@ def depends_on_motion(
       predicted from the others.
     - `worth`: smallest relevant change, in % of a joint's torque.
     """
-    _, least = allowed(fit.loop, worth)
     rows = ComparedRows.of_fit(fit, diagnosis)
     others = None if held_out is None else ComparedRows.of_comparison(held_out)
     error = over_recordings((fit if held_out is None else held_out).error_percent.to_numpy())
-
-    def seen(j: int) -> Dependence | None:
-        return among(rows, j, noise[j]) if others is None else on_others(rows, others, j, noise[j])
-
-    def sure(joints: Iterable[int]) -> dict[int, tuple[float, Dependence]]:
-        found = ((j, seen(j)) for j in joints)
-        parts = {j: (float(error[j] * np.sqrt(x.share)), x) for j, x in found if x and x.sure}
-        return {j: pair for j, pair in parts.items() if pair[0] > least}
-
-    reasons = sure(range(fit.loop.joints))
-    if reasons and held_out is not None and others is not None:
+    least = allowed(fit.loop, worth)[1] / np.maximum(error, 1e-300)
+    found = _dependent(rows, others, noise, dict(enumerate(least)))
+    if found and held_out is not None and others is not None:
         # The linearisation along the held-out runs compiles a program, so it is made only now.
         others = others.with_base(held_out)
-        reasons = sure(reasons)
-    if not reasons:
+        found = _dependent(rows, others, noise, {j: least[j] for j in found})
+    if not found:
         return ""
-    j, (part, found) = max(reasons.items(), key=lambda item: item[1][1].share)
-    where = "fitted" if others is None else "held-out"
+    j, seen = max(found.items(), key=lambda pair: pair[1].share)
+    where = "fitted" if held_out is None else "held-out"
     return (
         f"on the {where} recordings the error of {joint_columns(fit.loop.joints)[j]} is "
-        f"{error[j]:.3g} %, of which a regression on {found.on}, trained on other recordings, "
-        f"predicts {part:.3g} %: an effect is missing that no examined model describes"
+        f"{error[j]:.3g} %, of which a regression on {seen.on}, trained on other recordings, "
+        f"predicts {error[j] * np.sqrt(seen.share):.3g} %: an effect is missing that no examined "
+        "model describes"
     )
+
+
+def _dependent(
+    rows: ComparedRows,
+    others: ComparedRows | None,
+    noise: Sequence[ARFilter],
+    least: Mapping[int, float],
+) -> dict[int, Dependence]:
+    """Joints (from 0) whose residual depends on the motion by a relevant part.
+
+    **Arguments:**
+
+    - `least`: smallest relevant part of a joint's error, for the joints that are tried.
+    """
+    found = {}
+    for j, part in least.items():
+        seen = among(rows, j, noise[j]) if others is None else on_others(rows, others, j, noise[j])
+        if seen is not None and seen.sure and np.sqrt(seen.share) > part:
+            found[j] = seen
+    return found

@@ -13,11 +13,9 @@ from ..noise import ARFilter
 # Largest number of rows that a regression is trained on.
 _ROWS = 20_000
 
+# Position, velocity, acceleration and direction of joints, in this order.
 Motion = Float[np.ndarray, "_rows joints signals"]
 Series = Float[np.ndarray, " _rows"]
-
-# Position, velocity, acceleration and direction of a joint, in this order.
-SIGNALS = 4
 
 
 class AbstractRegression(eqx.Module):
