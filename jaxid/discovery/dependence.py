@@ -21,8 +21,9 @@ from .score import spanned
 from .system import System
 
 # A residual depends on the motion above this number of deviations and this share of its power. In
-# benchmarks.worlds the share was at most 0.05 for right models, 0.34 for a law outside the catalogue
-# at 2.8 times the noise floor, 0.34 for a resonance at 2.3 and 0.11 for presliding at 1.9 times.
+# benchmarks.worlds the share was at most 0.05 for right models, 0.34 for a law that is not in the
+# catalogue, at 2.8 times the noise floor, 0.34 for a resonance at 2.3 and 0.11 for presliding at
+# 1.9 times.
 _SURE, _SHARE = 4.0, 0.1
 
 
