@@ -1,4 +1,4 @@
-"""Whether a residual depends on the motion, and slow noise that a floor takes for an effect."""
+"""Whether a residual depends on the motion, and coloured noise that a floor takes for an effect."""
 
 import dataclasses
 
@@ -8,9 +8,9 @@ from scipy import signal
 
 import jaxid
 from jaxid.control import Tracking
+from jaxid.discovery.coloured_noise import above_floors, floor_with_coloured_noise
 from jaxid.discovery.dependence import ComparedRows, among, depends_on_motion, on_others
 from jaxid.discovery.regressions import AT_ONCE, WITH_MEMORY
-from jaxid.discovery.slow_noise import above_floors, floor_with_slow_noise
 from jaxid.noise import ARFilter
 
 SLOW = ARFilter(np.array([-1.6, 0.62]), 1.0)
@@ -34,10 +34,17 @@ def friction(motion: np.ndarray) -> np.ndarray:
     return motion[:, 0, 3] * motion[:, 0, 0] ** 2
 
 
-def ringing(motion: np.ndarray) -> np.ndarray:
+def ringing_at(frequency: float, rate: float, push: np.ndarray) -> np.ndarray:
+    """The speed of a weakly damped oscillator, of a standard deviation of one."""
+    w = 2 * np.pi * frequency
+    step = signal.cont2discrete(([1.0, 0.0], [1.0, 0.1 * w, w**2]), 1 / rate)
+    moved = signal.lfilter(step[0].ravel(), step[1], push)
+    return moved / np.std(moved)
+
+
+def resonance(motion: np.ndarray) -> np.ndarray:
     """A resonance at 7 Hz that each reversal of the first joint excites."""
-    step = signal.cont2discrete(([1.0, 0.0], [1.0, 5.0, 44.0**2]), 1 / 50)
-    return signal.lfilter(step[0].ravel(), step[1], motion[:, 0, 3])
+    return ringing_at(7.0, 50.0, motion[:, 0, 3])
 
 
 def drawn(
@@ -55,7 +62,7 @@ def drawn(
 
 
 @pytest.mark.parametrize("regressions", [AT_ONCE, WITH_MEMORY])
-def test_deviations_of_slow_noise_are_standard(regressions):
+def test_deviations_of_coloured_noise_are_standard(regressions):
     found = []
     for seed in range(40):
         # Noise of the other recording is stronger than where the filter was estimated.
@@ -108,7 +115,7 @@ def test_a_function_of_the_motion_is_seen_in_a_recording_that_it_was_not_trained
 
 def test_a_resonance_is_seen_by_the_regression_with_a_memory():
     for seed in range(5):
-        rows, other = drawn(seed, size=1.0, torque=ringing)
+        rows, other = drawn(seed, size=1.0, torque=resonance)
         seen = on_others(rows, other, 0, SLOW)
         assert seen.on == "the motion before and after"
         assert seen.sure
@@ -142,7 +149,12 @@ def test_rows_that_are_not_compared_are_left_out():
 
 
 def recorded(
-    name: str, seed: int, missing: float = 0.0, drift: float = 0.0, ringing: float = 0.0
+    name: str,
+    seed: int,
+    missing: float = 0.0,
+    drift: float = 0.0,
+    ringing: float = 0.0,
+    resonance: float = 0.0,
 ) -> jaxid.Recording:
     """A slide with dry friction in closed form, 20 s at 200 Hz, its torque with noise.
 
@@ -151,6 +163,7 @@ def recorded(
     - `missing`: size of a friction force that depends on position and velocity, N.
     - `drift`: standard deviation of a slow random walk after a second, N.
     - `ringing`: standard deviation of noise around 8 Hz, N.
+    - `resonance`: size of a resonance at 8 Hz that dry friction excites, N.
     """
     rng = np.random.default_rng(seed)
     time = np.arange(4000) / 200
@@ -165,6 +178,7 @@ def recorded(
     tau += 0.02 * rng.standard_normal(len(time))
     around = signal.butter(2, (7.0, 9.0), "bandpass", fs=200, output="sos")
     tau += ringing * signal.sosfilt(around, rng.standard_normal(len(time))) * 7
+    tau += resonance * ringing_at(8.0, 200.0, np.sign(v))
     tau += drift * np.cumsum(rng.standard_normal(len(time))) / np.sqrt(200)
     return jaxid.Recording.from_arrays(time, q[:, None], tau[:, None], name=name)
 
@@ -194,9 +208,9 @@ def test_the_floor_of_torque_that_drifts_is_its_error(drifting):
     there = np.isfinite(before.high)
     assert there.any()
     assert np.all(left[there] > 10 * before.high[there])
-    after = floor_with_slow_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
-    assert after.slow.all()
-    assert not before.slow.any()
+    after = floor_with_coloured_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
+    assert after.coloured.all()
+    assert not before.coloured.any()
     np.testing.assert_allclose(after.percent, left)
     np.testing.assert_array_equal(after.low[there], before.low[there])
     assert np.all(after.low < left)
@@ -206,18 +220,27 @@ def test_the_floor_of_torque_that_drifts_is_its_error(drifting):
     assert not above_floors(fit, changed, WORTH).any()
 
 
-def test_a_missing_effect_is_not_slow_noise(lacking):
+def test_a_missing_effect_is_not_coloured_noise(lacking):
     fit, diagnosis, held_out = lacking
     assert above_floors(fit, diagnosis, WORTH).all()
-    after = floor_with_slow_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
+    after = floor_with_coloured_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
     assert after is diagnosis.measured
 
 
-def test_what_rings_above_the_motion_is_not_slow_noise():
+def test_noise_above_the_frequencies_of_the_motion_is_noise():
     fit, diagnosis, held_out = diagnosed(ringing=0.1)
     assert above_floors(fit, diagnosis, WORTH).all()
-    after = floor_with_slow_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
+    after = floor_with_coloured_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
+    assert after.coloured.all()
+
+
+def test_a_resonance_that_the_motion_excites_is_not_noise():
+    fit, diagnosis, held_out = diagnosed(resonance=0.1)
+    assert above_floors(fit, diagnosis, WORTH).all()
+    after = floor_with_coloured_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
     assert after is diagnosis.measured
+    said = depends_on_motion(fit, diagnosis, diagnosis.noise, held_out, WORTH)
+    assert "a regression on the motion before and after" in said
 
 
 def test_an_effect_of_no_known_formula_is_told_from_other_recordings(lacking):

@@ -301,7 +301,7 @@ def test_an_effect_that_is_there_twice_is_chosen_twice(found, monkeypatch):
     assert asked == [other]
 
 
-def test_the_held_out_floor_leaves_out_joints_with_slow_noise_and_names_the_others(found):
+def test_the_held_out_floor_leaves_out_joints_with_coloured_noise_and_names_the_others(found):
     after = found.steps[-1].held_out
     left = after.error_percent.to_numpy()
     sources = (("above the motion",) * 2,) * len(left)

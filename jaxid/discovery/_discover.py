@@ -22,6 +22,7 @@ from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
 from .alongside import along_recorded, in_the_loop, one_late_drive, without_law
 from .asked import Asked, check_apart
+from .coloured_noise import floor_with_coloured_noise
 from .dependence import depends_on_motion
 from .diagnosis import over_recordings
 from .held_out import diverges, on_held_out, raised, tested, with_held_out
@@ -33,7 +34,6 @@ from .remarks import remarks
 from .screening import not_examined
 from .search import Search
 from .shapes import with_shapes
-from .slow_noise import floor_with_slow_noise
 from .step import Step
 from .story import Discovery
 from .text import joined
@@ -220,7 +220,7 @@ def _told(
     models = search.visited.weighed(search.at)
     steps = tested(search, _steps(search, models))
     if not interrupted:
-        steps = [*steps[:-1], _with_slow_noise(search, steps[-1])]
+        steps = [*steps[:-1], _with_coloured_noise(search, steps[-1])]
     models = with_held_out(search, models, steps)
     short = _stopped_short(search.asked.most)
     reason = _STOPPED if interrupted else diverges(search, steps[-1]) or raised(search, steps)
@@ -266,12 +266,12 @@ def _told(
     )
 
 
-def _with_slow_noise(search: Search, last: Step) -> Step:
-    """The last step, with the noise floor of joints whose residual is shown to be slow noise."""
+def _with_coloured_noise(search: Search, last: Step) -> Step:
+    """The last step, with the noise floor of joints whose residual is shown to be noise."""
     if last.diagnosis is None or last.fit.status is not Status.converged:
         return last
     noise, worth = search.at.noise, search.asked.worth
-    floor = floor_with_slow_noise(last.fit, last.diagnosis, noise, last.held_out, worth)
+    floor = floor_with_coloured_noise(last.fit, last.diagnosis, noise, last.held_out, worth)
     diagnosis = dataclasses.replace(last.diagnosis, measured=floor)
     return dataclasses.replace(last, diagnosis=diagnosis)
 

@@ -37,8 +37,8 @@ class Floor(eqx.Module):
     sources: tuple[tuple[str, ...], ...] = eqx.field(static=True)
 
     @property
-    def slow(self) -> Bool[np.ndarray, " joints"]:
-        """Joints whose noise is slow, so that its level above the motion is too low."""
+    def coloured(self) -> Bool[np.ndarray, " joints"]:
+        """Joints whose noise is coloured, so that its level above the motion is too low."""
         return np.asarray(np.all(np.array(self.sources) == "unpredicted", axis=0))
 
 

@@ -122,12 +122,12 @@ def refuted_unseen(
 
 
 def _floor_of_unseen(fit: Fit, measured: Floor | None, unseen: Comparison) -> Floor | None:
-    """The measured noise floor of held-out recordings, without joints with slow noise."""
+    """The measured noise floor of held-out recordings, without joints with coloured noise."""
     floor = floor_of(unseen.loop, unseen.recordings, fit.recordings)
     if floor is None or measured is None:
         return floor
     percent, low, high = (
-        np.where(measured.slow, np.nan, x) for x in (floor.percent, floor.low, floor.high)
+        np.where(measured.coloured, np.nan, x) for x in (floor.percent, floor.low, floor.high)
     )
     return dataclasses.replace(floor, percent=percent, low=low, high=high)
 
@@ -159,7 +159,7 @@ def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
     """The reason if torque seems shifted in time against motion.
 
     To first order the residual of a shift is the derivative of torque. No curve of one coordinate
-    describes it, and a noise filter models it as slow noise.
+    describes it, and a noise filter models it as coloured noise.
     """
     data, motion = diagnosis.data, diagnosis.motion
     torque, time = np.asarray(motion.tau), np.asarray(motion.t)
