@@ -59,8 +59,7 @@ def floor_with_coloured_noise(
     for j in np.flatnonzero(high).tolist():
         free = 1 - min(float(over_recordings(low)[j] / over_recordings(left)[j]), 1.0) ** 2
         coloured[j] = _independent(rows, unseen, j, noise[j]) and all(
-            _would_be_seen(rows, diagnosis, j, noise[j], free, *kind)
-            for kind in ((AT_ONCE, False), (WITH_MEMORY, True))
+            _would_be_seen(rows, diagnosis, j, noise[j], free, rings) for rings in (False, True)
         )
     return _raised(measured, left, low, coloured)
 
@@ -98,7 +97,6 @@ def _would_be_seen(
     joint: int,
     filt: ARFilter,
     share: float,
-    regressions: tuple[AbstractRegression, ...],
     rings: bool,
 ) -> bool:
     """Whether regressions see most functions of the motion as large as what is above the floor.
@@ -106,11 +104,11 @@ def _would_be_seen(
     **Arguments:**
 
     - `share`: of the residual's power that is above the floor.
-    - `rings`: whether each function excites a resonance.
+    - `rings`: whether it is that of resonances, by the regression with a memory.
     """
     count = np.cumsum([len(r) for r in rows.residual])[:-1]
     rest = np.concatenate(rows.residual)
-    found = []
+    regressions, found = WITH_MEMORY if rings else AT_ONCE, []
     for torque in _torques(rows, diagnosis, joint, rings):
         size = np.sqrt(share * np.sum(rest[:, joint] ** 2))
         changed = np.sqrt(1 - share) * rest

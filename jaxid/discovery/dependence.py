@@ -4,7 +4,7 @@ Scores and noise filters cannot tell slow noise from the torque of a missing eff
 of a recording is not a function of the motion of another one, and the torque of most effects is.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -88,11 +88,6 @@ class ComparedRows(eqx.Module):
         base = None if self.base is None else chosen(self.base)
         return ComparedRows(chosen(self.motion), chosen(self.residual), base)
 
-    def of_joint(self, joint: int) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
-        """Residual and base of one joint (from 0), by recording."""
-        base = None if self.base is None else [x[:, joint] for x in self.base]
-        return [r[:, joint] for r in self.residual], base
-
 
 def _signals(
     *motion: Float[np.ndarray, "*rows joints"],
@@ -119,45 +114,73 @@ class Dependence(eqx.Module):
         """Whether the residual depends on the motion, by a part that counts."""
         return self.deviations > _SURE and self.share > _SHARE
 
+
+class Target(eqx.Module):
+    """The residual of a joint, to be compared with predictions of it.
+
+    - `residual`: by recording, N·m or N; zero at rows that are not compared.
+    - `filt`: its noise filter.
+    - `basis`: directions of all its rows, and of its whitened ones, that the model's parameters can
+      change; None if they are not known. Errors of parameters come from the noise that a regression
+      was trained on, so they would be taken for a missing effect.
+    """
+
+    residual: tuple[Float[np.ndarray, " _rows"], ...]
+    filt: ARFilter
+    basis: tuple[Float[np.ndarray, "rows rank"], Float[np.ndarray, "rows white"]] | None
+
     @classmethod
-    def of(
-        cls,
-        predicted: Sequence[Float[np.ndarray, " _rows"]],
-        residual: Sequence[Float[np.ndarray, " _rows"]],
-        filt: ARFilter,
-        on: str,
-        *,
-        base: Sequence[Float[np.ndarray, "_rows absorbed"]] | None = None,
-        twice: bool = False,
-    ) -> "Dependence":
-        """The agreement of a predicted and a residual series, by recording.
+    def of(cls, rows: ComparedRows, joint: int, filt: ARFilter) -> "Target":
+        """The residual of a joint (from 0)."""
+        residual, basis = tuple(r[:, joint] for r in rows.residual), None
+        if rows.base is not None:
+            base = [
+                x[:, joint] * (r != 0)[:, None] for x, r in zip(rows.base, residual, strict=True)
+            ]
+            basis = spanned(np.concatenate(base)), spanned(_white(base, residual, filt))
+        return cls(residual, filt, basis)
+
+    def dependence(
+        self, predicted: Sequence[Float[np.ndarray, " _rows"]], on: str, twice: bool = False
+    ) -> Dependence:
+        """The agreement of the residual with a prediction, by recording.
 
         **Arguments:**
 
-        - `filt`: noise filter of the residual. `on`: what the prediction depends on.
-        - `base`: what the model's parameters can change. Their errors, which come from the noise
-          that the regression was trained on, are then not taken for a missing effect.
+        - `on`: what the prediction depends on.
         - `twice`: whether each recording has been predicted from the others.
         """
-        there = [r != 0 for r in residual]
-
-        def agreement(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> float:
-            def rows(series: Sequence[np.ndarray]) -> np.ndarray:
-                return np.concatenate([change(x, k) for x, k in zip(series, there, strict=True)])
-
-            x, y = rows(predicted), rows(residual)
-            if base is not None:
-                absorbed = spanned(rows(base))
-                x, y = (z - absorbed @ (absorbed.T @ z) for z in (x, y))
-            return float(x @ y / max(np.linalg.norm(x) * np.linalg.norm(y), 1e-300))
-
         # The deviation is that of these recordings, where noise may be stronger than where the
         # filter was estimated.
-        count = sum(map(np.count_nonzero, there))
+        count = sum(map(np.count_nonzero, self.residual))
         # If two recordings predict each other, their two products may be equal.
         independent = count / 2 if twice else count
-        share = max(agreement(lambda x, kept: (x.T * kept).T), 0.0) ** 2
-        return cls(share, float(np.sqrt(independent)) * agreement(filt.innovations), on)
+        plain, white = (None, None) if self.basis is None else self.basis
+        share = _alike(np.concatenate(predicted), np.concatenate(self.residual), plain)
+        x, y = (_white(z, self.residual, self.filt) for z in (predicted, self.residual))
+        deviations = float(np.sqrt(independent)) * _alike(x, y, white)
+        return Dependence(max(share, 0.0) ** 2, deviations, on)
+
+
+def _white(
+    series: Sequence[Float[np.ndarray, "_rows *columns"]],
+    residual: Sequence[Float[np.ndarray, " _rows"]],
+    filt: ARFilter,
+) -> Float[np.ndarray, "rows *columns"]:
+    """The innovations of series of all recordings at the compared rows of a residual."""
+    pairs = zip(series, residual, strict=True)
+    return np.concatenate([filt.innovations(x, r != 0) for x, r in pairs])
+
+
+def _alike(
+    x: Float[np.ndarray, " rows"],
+    y: Float[np.ndarray, " rows"],
+    absorbed: Float[np.ndarray, "rows rank"] | None,
+) -> float:
+    """Cosine of the angle between two series, without the directions that are absorbed."""
+    if absorbed is not None:
+        x, y = (z - absorbed @ (absorbed.T @ z) for z in (x, y))
+    return float(x @ y / max(np.linalg.norm(x) * np.linalg.norm(y), 1e-300))
 
 
 def on_others(
@@ -176,12 +199,11 @@ def on_others(
 
     - `joint`: from 0. `filt`: noise filter of its residual.
     """
-    rest, base = others.of_joint(joint)
-    found = []
+    target, found = Target.of(others, joint, filt), []
     for regression in regressions:
         for used in trained.sets(joint):
             predicted = _predicted(regression, trained, others, joint, used, filt)
-            found.append(Dependence.of(predicted, rest, filt, regression.on, base=base))
+            found.append(target.dependence(predicted, regression.on))
     return _best(found)
 
 
@@ -200,14 +222,14 @@ def among(
     every = range(len(rows.residual))
     if len(every) < 2:
         return None
-    (rest, base), found = rows.of_joint(joint), []
+    target, found = Target.of(rows, joint, filt), []
     for regression in regressions:
         for used in rows.sets(joint):
             predicted = []
             for k in every:
                 others = rows.only([i for i in every if i != k])
                 predicted += _predicted(regression, others, rows.only([k]), joint, used, filt)
-            found.append(Dependence.of(predicted, rest, filt, regression.on, base=base, twice=True))
+            found.append(target.dependence(predicted, regression.on, twice=True))
     return _best(found)
 
 

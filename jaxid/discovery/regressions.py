@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..noise import ARFilter
 
@@ -66,9 +66,7 @@ class Trees(AbstractRegression):
     ) -> list[Series]:
         from sklearn.ensemble import ExtraTreesRegressor
 
-        rest = np.concatenate(residual)
-        there = np.flatnonzero(rest)
-        there = there[:: max(1, -(-len(there) // _ROWS))]
+        rest, there = np.concatenate(residual), _trained_on(residual)
         if len(there) <= self.leaf:
             return [np.zeros(len(x)) for x in others]
         trees = ExtraTreesRegressor(self.trees, min_samples_leaf=self.leaf, random_state=0)
@@ -106,8 +104,7 @@ class DistributedLags(AbstractRegression):
         pairs = [(x / scale, r) for x, r in zip(signals, residual, strict=True)]
         columns = np.concatenate([filt.innovations(x, r != 0) for x, r in pairs])
         white = np.concatenate([filt.innovations(r, r != 0) for r in residual])
-        there = np.flatnonzero(np.concatenate(residual))
-        there = there[:: max(1, -(-len(there) // _ROWS))]
+        there = _trained_on(residual)
         if len(there) < 2:
             return [np.zeros(len(x)) for x in others]
         level = np.mean(np.sum(columns[there] ** 2, axis=0))
@@ -123,6 +120,12 @@ class DistributedLags(AbstractRegression):
         shifts = np.arange(-self.lags, self.lags + 1)
         rows = np.clip(np.arange(len(motion))[:, None] + shifts, 0, len(motion) - 1)
         return motion[:, :, 1:][rows].reshape(len(motion), -1)
+
+
+def _trained_on(residual: Sequence[Series]) -> Int[np.ndarray, " used"]:
+    """Numbers of the compared rows of all recordings, or of evenly spaced ones if they are many."""
+    there = np.flatnonzero(np.concatenate(residual))
+    return there[:: max(1, -(-len(there) // _ROWS))]
 
 
 def _wide(motion: Motion) -> Float[np.ndarray, "_rows columns"]:
