@@ -51,7 +51,9 @@ def floor_with_coloured_noise(
     if not high.any():
         return measured
     rows = ComparedRows.of_fit(chosen, diagnosis)
-    unseen = None if held_out is None else ComparedRows.of_comparison(held_out)
+    unseen = None
+    if held_out is not None:
+        unseen = ComparedRows.of_comparison(held_out).with_base(held_out)
     low = np.minimum(diagnosis.floor, left)
     if measured is not None:
         low = np.where(np.isfinite(measured.low), np.minimum(measured.low, low), low)
