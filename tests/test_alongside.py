@@ -18,6 +18,7 @@ from jaxid.control import PD, OpenLoop, Sampled, Tracking
 from jaxid.discovery import _discover, alongside, started
 from jaxid.discovery.alongside import (
     along_recorded,
+    approximating,
     delays_of_drives,
     in_the_loop,
     late_drives,
@@ -25,6 +26,7 @@ from jaxid.discovery.alongside import (
 )
 from jaxid.discovery.ranking import judge
 from jaxid.discovery.screening import screen
+from jaxid.discovery.step import Step
 from jaxid.effects import Coulomb, JointElasticity, Stribeck, TimeDelay, TorqueOffset, Viscous
 
 LAW = PD(Kp=[800.0, 600.0, 3000.0, 90.0], Kv=[80.0, 60.0, 300.0, 9.0])
@@ -113,31 +115,75 @@ def slide() -> jaxid.ClosedLoop:
 @pytest.mark.parametrize(
     ("loop", "effects", "doubtful"),
     [
-        (slide(), [LATE, TorqueOffset(joint=1), Stribeck(joint=1)], True),
-        (slide(), [LATE, TorqueOffset(joint=1)], False),
+        (slide(), [LATE, TorqueOffset(joint=1)], True),
+        (slide(), [LATE], False),
         (slide(), [TorqueOffset(joint=1), Stribeck(joint=1)], False),
         (scara(), [LATE, TorqueOffset(joint=1), Stribeck(joint=2)], False),
     ],
 )
 def test_effects_beside_a_single_late_drive_may_approximate_a_sampled_law(loop, effects, doubtful):
-    why, most = one_late_drive(loop, effects, period=2e-3)
+    why = one_late_drive(loop, effects, period=2e-3)
     assert ("like a law that is sampled" in why) == doubtful
-    assert most == 0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("most", "repeated"), [(1, True), (0, False)])
-def test_a_search_without_the_law_counts_if_it_needs_few_effects(
-    monkeypatch, tmp_path, most, repeated
-):
-    monkeypatch.setattr(_discover, "one_late_drive", lambda *_: ("the law is late, so", most))
+@pytest.mark.parametrize("needless", [(Stribeck(joint=1),), ()])
+def test_a_search_without_the_law_counts_if_effects_are_needless(monkeypatch, tmp_path, needless):
+    monkeypatch.setattr(_discover, "one_late_drive", lambda *_: "the law is late, so")
+    monkeypatch.setattr(_discover, "approximating", lambda *_: needless)
     fit, held_out = slides(seed=1), slides(seed=2)
     given = {"catalogue": [TorqueOffset], "progress": False, "resume": tmp_path}
     found = jaxid.discover(slide(), fit, held_out, **given)
     assert found.verdict == "explained"
     assert [s.label for s in found.steps] == ["start", "+ torque_offset on joint 1"]
-    assert all(isinstance(s.fit.loop.controller, Tracking) == repeated for s in found.steps)
-    assert any("the law is late, so sets" in note for note in found.notes) == repeated
+    assert all(isinstance(s.fit.loop.controller, Tracking) == bool(needless) for s in found.steps)
+    said = "the law is late, so sets of effects are compared along the recorded motion"
+    assert any(said in note for note in found.notes) == bool(needless)
+
+
+@pytest.fixture(scope="module")
+def along() -> Sequence[Step]:
+    """The start and a last step without the law that has the offset."""
+    loop = dataclasses.replace(slide(), controller=Tracking())
+    steps = []
+    for added in (None, TorqueOffset(joint=1)):
+        fit = jaxid.fit(loop if added is None else loop.add(added), slides(seed=1))
+        steps.append(Step("", fit, None, jaxid.diagnose(fit, catalogue=[Stribeck]), added))
+    return steps
+
+
+PEAK = Stribeck(joint=1, level=0.5, velocity=0.05)
+FAINT = dataclasses.replace(PEAK, level=1e-4)
+STIFF = JointElasticity(joint=1, compliance=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("beside", "unseen", "approximates"),
+    [
+        # A peak at low speed as large as the offset would be seen along the recorded motion.
+        (PEAK, "lowers", True),
+        # So small a peak would not, nor would a stiff transmission.
+        (FAINT, "lowers", False),
+        (FAINT, None, False),
+        (STIFF, "lowers", False),
+        # Held-out recordings do not confirm them.
+        (FAINT, "unchanged", True),
+        (STIFF, "unchanged", True),
+    ],
+)
+def test_an_effect_for_which_nothing_else_speaks_approximates_the_law(
+    along, beside, unseen, approximates
+):
+    last = along[-1]
+    late = dataclasses.replace(last, added=LATE)
+    more = dataclasses.replace(last, added=beside, unseen=unseen)
+    found = approximating([*along, late, more], along)
+    assert found == ((beside,) if approximates else ())
+
+
+def test_no_effect_approximates_the_law_if_as_many_are_needed_without_it(along):
+    late = dataclasses.replace(along[-1], added=LATE)
+    assert approximating([*along, late], along) == ()
 
 
 @pytest.mark.slow
@@ -150,7 +196,7 @@ def test_an_interrupted_search_without_the_law_leaves_the_answer_open(monkeypatc
             raise KeyboardInterrupt
         return searched(*given)
 
-    monkeypatch.setattr(_discover, "one_late_drive", lambda *_: ("the law is late, so", 1))
+    monkeypatch.setattr(_discover, "one_late_drive", lambda *_: "the law is late, so")
     monkeypatch.setattr(_discover, "_searched", interrupted_again)
     found = jaxid.discover(slide(), slides(seed=1), catalogue=[TorqueOffset], progress=False)
     assert found.interrupted

@@ -129,6 +129,31 @@ def test_tracking_compares_torques_that_passed_the_same_low_pass(loop, recording
     assert np.array_equal(found.residuals[0], measured - simulated)
 
 
+def without(recording, *gaps):
+    """The recording without the samples of some stretches, s."""
+    kept = np.ones(recording.samples, bool)
+    for begin, end in gaps:
+        kept[(recording.time > begin) & (recording.time < end)] = False
+    signals = (getattr(recording, name)[kept] for name in ("time", "q", "tau"))
+    return jaxid.Recording.from_arrays(*signals, q_ref=recording.q_ref[kept], gaps="allow")
+
+
+def test_tracking_compares_nothing_beside_a_gap(loop, recordings):
+    tracking = dataclasses.replace(loop, controller=Tracking(cutoff=5.0))
+    # Half a period of the cutoff is 0.1 s.
+    short, long = ((3.0, 3.08), (3.0, 3.3))
+    for gap, left_out in ((short, False), (long, True)):
+        found = jaxid.compare(tracking, without(recordings[0], gap))
+        time = found.judged(0)[0]
+        beside = (time > gap[0] - 0.6) & (time < gap[1] + 0.6)
+        assert beside.any() != left_out
+        assert time[-1] > 6.0
+    slow = dataclasses.replace(loop, controller=Tracking(cutoff=2.0))
+    gaps = [(t, t + 0.3) for t in (2.5, 4.0, 5.5)]
+    with pytest.raises(jaxid.errors.RecordingError, match="on both sides of a gap"):
+        jaxid.compare(slow, without(recordings[0], *gaps))
+
+
 def test_what_a_comparison_shows(loop, recordings):
     found = jaxid.compare(loop, recordings)
     assert "relative error in %" in repr(found)

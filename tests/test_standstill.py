@@ -178,3 +178,21 @@ def test_unseen_samples_slower_than_any_fitted_one_are_not_compared():
     error = jaxid.compare(fit.loop, slower).error_percent.to_numpy()
     forgotten = dataclasses.replace(fit.loop, standstill=Standstill().settled(1, True))
     assert error < 0.7 * jaxid.compare(forgotten, slower).error_percent.to_numpy()
+
+
+@pytest.mark.filterwarnings("ignore:.*gap")
+def test_standstill_is_found_at_its_time_if_samples_are_missing():
+    """Half a second is missing, and every fiftieth sample."""
+    whole = recorded(1, stribeck)
+    kept = np.arange(whole.samples) % 50 != 7
+    kept[(whole.time > 8.0) & (whole.time < 8.5)] = False
+    gappy = jaxid.Recording.from_arrays(
+        whole.time[kept], whole.q[kept], whole.tau[kept], name="gappy", gaps="allow"
+    )
+    cutoff, standstill = 20.0, Standstill(still=0.05, reach=1.0)
+    expected = standstill.moving(whole, cutoff)[kept]
+    found = standstill.moving(gappy, cutoff)
+    beside = np.abs(gappy.time - 8.25) < 0.5
+    assert 0.1 < np.mean(~expected) < 0.9
+    # Samples at the edges of standstill may differ.
+    assert np.mean(found[~beside] != expected[~beside]) < 0.01

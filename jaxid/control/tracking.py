@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..parameters import Scalar, as_float64, parameter
 from ..recording import Recording
-from ..signals.smoothing import even_times, resampled, signal_cutoff, smooth_motion
+from ..signals.smoothing import signal_cutoff, smooth_samples
 from ._base import AbstractController, Reading, Reference, Signals
 
 # Largest cutoff on the motion as a share of the sample rate. There the second derivative of a cubic
@@ -103,5 +103,4 @@ class Tracking(AbstractController):
         self, recording: Recording, q: Float[np.ndarray, "samples joints"]
     ) -> Float[np.ndarray, "samples joints"]:
         """Positions at the times of a recording, low-passed like its own, rad or m."""
-        smooth = smooth_motion(recording, self.known(recording), q=q)
-        return resampled(even_times(recording), smooth, recording.time)
+        return smooth_samples(recording, self.known(recording), q=q)

@@ -20,7 +20,13 @@ from ..simulation.loop import ClosedLoop
 from ..simulation.sharing import with_one_blas_thread
 from ..storage.campaign import Campaign
 from ..storage.classes import classes_of
-from .alongside import along_recorded, in_the_loop, one_late_drive, without_law
+from .alongside import (
+    along_recorded,
+    approximating,
+    in_the_loop,
+    one_late_drive,
+    without_law,
+)
 from .asked import Asked, check_apart
 from .coloured_noise import floor_with_coloured_noise
 from .dependence import depends_on_motion
@@ -28,7 +34,7 @@ from .diagnosis import over_recordings
 from .held_out import diverges, on_held_out, raised, tested, with_held_out
 from .hypotheses import effect_on
 from .landscape import form
-from .models import Model, Named, named, probability, worth_keeping
+from .models import Model, Named, listed, named, probability, worth_keeping
 from .parts import without_parts
 from .remarks import remarks
 from .screening import not_examined
@@ -143,7 +149,7 @@ def _with_and_without_law(
     """The result of a search, or of one without the law if effects of it approximate the law.
 
     With one joint a late drive and a sampled law are the same. The law is not the declared one if
-    several effects beside the late drive are not needed along the recorded motion.
+    an effect beside the late drive is not needed along the recorded motion.
 
     **Arguments:**
 
@@ -155,7 +161,7 @@ def _with_and_without_law(
     if story.verdict != "explained" or along is loop or imposed(story.fit.loop):
         return story
     effects = [step.added for step in story.steps if step.added is not None]
-    why, most = one_late_drive(loop, effects, story.fit.recordings.common_period())
+    why = one_late_drive(loop, effects, story.fit.recordings.common_period())
     if not why:
         return story
     again = begun("without the law, ")
@@ -163,13 +169,18 @@ def _with_and_without_law(
     stopped = dataclasses.replace(story, verdict="undetermined", interrupted=True, reason=_STOPPED)
     try:
         other = _searched(again, along, started)
+        sure = other.verdict in ("adequate", "explained") and not other.interrupted
+        needless = approximating(story.steps, other.steps) if sure else ()
     except KeyboardInterrupt:
         return stopped
     if other.interrupted:
         return stopped
-    if other.verdict not in ("adequate", "explained") or len(other.steps) - 1 > most:
+    if not needless:
         return story
-    note = f"{why} sets of effects are compared along the recorded motion, without the law"
+    note = (
+        f"{why} sets of effects are compared along the recorded motion, without the law, where "
+        f"this is not needed: {listed(needless)}"
+    )
     return dataclasses.replace(other, notes=(note, *other.notes))
 
 

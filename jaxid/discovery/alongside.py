@@ -18,18 +18,18 @@ from ..simulation.steps import UNROLLED, needed_substeps
 from .comparison import compare
 from .diagnosis import Diagnosis
 from .explore import DECISIVE
+from .landscape import form
 from .predict import Prediction, Predictor
 from .ranking import Screened
 from .score import Whitened, strong_directions
 from .separate import columns_of, select
+from .step import Step
+from .system import System
 
 # Largest delay of a torque in samples that a sampled law explains.
 LATE = 2.0
 # Smallest significant delay, in standard deviations, and largest ratio of delays with one cause.
 _SURE, _ALIKE = 3.0, 2.0
-# Number of effects beside a late drive that must not be needed without the law. One may be missed
-# there, because a part of it is above the cutoff.
-_FEWER = 2
 # Delays of a drive.
 DELAYS = (TimeDelay, ActuatorLag)
 # Effects that are the same as the delay of a drive, or approximate it.
@@ -90,24 +90,51 @@ def late_drives(given: ClosedLoop, effects: Sequence[AbstractEffect], period: fl
     return _as_sampled(_late(given, effects, period)) if given.joints > 1 else ""
 
 
-def one_late_drive(
-    given: ClosedLoop, effects: Sequence[AbstractEffect], period: float
-) -> tuple[str, int]:
+def one_late_drive(given: ClosedLoop, effects: Sequence[AbstractEffect], period: float) -> str:
     """Why a search on one joint is repeated without the law; empty if it need not be.
 
     A single drive that is late may be an effect, or the law is sampled. A sampled law that is
-    simulated as continuous has further errors, which several effects then approximate. Without the
-    law they are not needed.
+    simulated as continuous has further errors, which other effects then approximate.
 
     **Arguments:** those of `late_drives`.
-
-    **Returns:** the reason, and the largest number of effects without the law that confirms it.
     """
     others = [e for e in effects if not isinstance(e, DELAYS)]
-    most = len(others) - _FEWER
-    if given.joints > 1 or most < 0:
-        return "", 0
-    return _as_sampled(_late(given, effects, period)), most
+    return _as_sampled(_late(given, effects, period)) if given.joints == 1 and others else ""
+
+
+def approximating(steps: Sequence[Step], along: Sequence[Step]) -> tuple[AbstractEffect, ...]:
+    """Effects beside a late drive that only approximate a sampled law.
+
+    They are those that a search without the law does not add, if it adds fewer, and if nothing else
+    speaks for any of them: held-out recordings do not confirm it, or the recorded motion
+    contradicts it. (An effect that acts above the cutoff may be missed without the law.)
+
+    **Arguments:**
+
+    - `steps`: of a search under the law. `along`: of a search without it.
+    """
+    others = [s for s in steps if s.added is not None and not isinstance(s.added, DELAYS)]
+    kept = [form(s.added) for s in along if s.added is not None]
+    if len(kept) >= len(others):
+        return ()
+    gone = [s for s in others if s.added is not None and form(s.added) not in kept]
+    doubtful = (s.unseen in ("unchanged", "raises") or _contradicted(along[-1], s) for s in gone)
+    return tuple(s.added for s in gone if s.added is not None) if all(doubtful) else ()
+
+
+def _contradicted(along: Step, step: Step) -> bool:
+    """Whether a model without the law is worse with the effect of a step, all else estimated again.
+
+    A transmission has a motion of its own, which the recorded motion does not give.
+    """
+    assert along.diagnosis is not None
+    if step.added is None or isinstance(step.added, AbstractTransmission):
+        return False
+    data, noise = along.diagnosis.data, along.diagnosis.noise
+    predictor = Predictor.of(System.of(along.fit), noise, data.level)
+    without, there = predictor.predict(()), predictor.predict((step.added,), steps=1)
+    rows = int(predictor.data.compared.sum())
+    return bool(rows * np.log(there.loss / without.loss) > DECISIVE)
 
 
 def _late(given: ClosedLoop, effects: Sequence[AbstractEffect], period: float) -> tuple[float, ...]:

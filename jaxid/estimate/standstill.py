@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..recording import Recording
-from ..signals.smoothing import even_times, smooth_motion
+from ..signals.smoothing import smooth_samples
 from ..signals.standstill import STILL, Standstill
 from ..simulation.batch import motion_cutoff
 from ..simulation.dynamics import imposed
@@ -182,8 +182,8 @@ def _motion(
     recording: Recording, cutoff: float
 ) -> tuple[Float[np.ndarray, "samples joints"], Float[np.ndarray, "samples joints"]]:
     """Speed over its maximum, and the distance since the last reversal."""
-    q = smooth_motion(recording, cutoff)
-    v = np.gradient(q, even_times(recording), axis=0)
+    q = smooth_samples(recording, cutoff)
+    v = np.gradient(q, recording.time, axis=0)
     turned = np.zeros(q.shape, int)
     turned[1:] = np.where(v[1:] * v[:-1] < 0, np.arange(1, len(q))[:, None], 0)
     last = np.maximum.accumulate(turned, axis=0)

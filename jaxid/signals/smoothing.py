@@ -96,6 +96,16 @@ def smooth_motion(
     return low_pass(q, recording.rate, cutoff, order)
 
 
+def smooth_samples(
+    recording: Recording, cutoff: float, q: Float[np.ndarray, "samples joints"] | None = None
+) -> Float[np.ndarray, "samples joints"]:
+    """The recorded position, low-passed, at the recording's samples, rad or m.
+
+    **Arguments:** those of `smooth_motion`.
+    """
+    return resampled(even_times(recording), smooth_motion(recording, cutoff, q=q), recording.time)
+
+
 def signal_cutoff(*recordings: Recording, highest: float = 1 / 8) -> float:
     """The frequency in Hz above which recorded motions do not determine acceleration.
 
@@ -192,7 +202,8 @@ class Band(eqx.Module):
 
     - `gain`: gain of the filter at the frequencies of a real Fourier transform.
     - `rate`: sample rate of each recording, Hz.
-    - `rows`: the samples that are compared, far enough from the ends; `keep` marks those present.
+    - `rows`: the samples that are compared, far enough from the ends and from gaps; `keep` marks
+      those present.
     """
 
     gain: Inexact[Array, "recordings frequencies"]
@@ -213,7 +224,8 @@ class Band(eqx.Module):
 
         - `cutoffs`: frequency up to which each recording's motion is known, Hz; the lowest is used.
 
-        **Raises:** `RecordingError` if a recording is shorter than the filter's settling time.
+        **Raises:** `RecordingError` if a recording, or what is between its gaps, is shorter than
+        the filter's settling time.
         """
         import scipy
 
@@ -224,14 +236,7 @@ class Band(eqx.Module):
             sections = scipy.signal.butter(ORDER, cutoff, fs=r.rate, output="sos")
             grid = np.fft.rfftfreq(size, 1 / r.rate)
             gains.append(np.abs(scipy.signal.sosfreqz(sections, grid, fs=r.rate)[1]) ** 2)
-            trim = int(np.ceil(_ENDS * r.rate / cutoff))
-            step = max(1, int(r.rate / (_SAMPLES * cutoff)))
-            rows.append(np.arange(trim, r.samples - trim, step))
-            if r.samples - 2 * trim < 10:
-                raise RecordingError(
-                    f"{r.name} lasts {r.duration:.3g} s, but its low-pass at {cutoff:.3g} Hz needs "
-                    f"{_ENDS / cutoff:.3g} s at each end: give longer recordings or windows"
-                )
+            rows.append(_compared_rows(r, cutoff))
         most = shared_length(max(len(row) for row in rows))
         keep = np.arange(most) < np.array([[len(row)] for row in rows])
         filled = np.stack([np.pad(row, (0, most - len(row)), "edge") for row in rows])
@@ -268,3 +273,26 @@ class Band(eqx.Module):
     ) -> Shaped[Array, "recordings rows *axes"]:
         """The compared rows of signals."""
         return x[jnp.arange(len(self.rows))[:, None], self.rows]
+
+
+def _compared_rows(recording: Recording, cutoff: float) -> Int[np.ndarray, " rows"]:
+    """The samples that are compared if signals are low-passed.
+
+    In a gap longer than half a period of the cutoff the motion is not known, so a gap has two ends.
+
+    **Raises:** `RecordingError` if there are fewer than ten.
+    """
+    time, settling = recording.time, _ENDS / cutoff
+    trim = int(np.ceil(settling * recording.rate))
+    step = max(1, int(recording.rate / (_SAMPLES * cutoff)))
+    rows = np.arange(trim, recording.samples - trim, step)
+    for k in np.flatnonzero(np.diff(time) > 0.5 / cutoff):
+        before, after = time[k] - time[rows], time[rows] - time[k + 1]
+        rows = rows[np.maximum(before, after) >= settling]
+    if len(rows) * step < 10:
+        raise RecordingError(
+            f"{recording.name} lasts {recording.duration:.3g} s, but its low-pass at {cutoff:.3g} "
+            f"Hz needs {settling:.3g} s at each end and on both sides of a gap: give longer "
+            "recordings or windows"
+        )
+    return rows

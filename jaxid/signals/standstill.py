@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..recording import Recording
-from .smoothing import even_times, smooth_motion
+from .smoothing import smooth_samples
 
 # Share of its highest speed below which a joint stands still.
 STILL = 0.01
@@ -103,8 +103,8 @@ class Standstill(eqx.Module):
 
 
 def _speed(recording: Recording, cutoff: float) -> Float[np.ndarray, "samples joints"]:
-    """The speed of the low-passed motion."""
-    return np.gradient(smooth_motion(recording, cutoff), even_times(recording), axis=0)
+    """The speed of the low-passed motion at the samples."""
+    return np.gradient(smooth_samples(recording, cutoff), recording.time, axis=0)
 
 
 def _far_from(there: Bool[np.ndarray, " samples"], reach: float) -> Bool[np.ndarray, " samples"]:
