@@ -155,6 +155,7 @@ def recorded(
     drift: float = 0.0,
     ringing: float = 0.0,
     resonance: float = 0.0,
+    offset: float = 0.0,
 ) -> jaxid.Recording:
     """A slide with dry friction in closed form, 20 s at 200 Hz, its torque with noise.
 
@@ -164,6 +165,7 @@ def recorded(
     - `drift`: standard deviation of a slow random walk after a second, N.
     - `ringing`: standard deviation of noise around 8 Hz, N.
     - `resonance`: size of a resonance at 8 Hz that dry friction excites, N.
+    - `offset`: of the torque, N; of the other sign in every second recording.
     """
     rng = np.random.default_rng(seed)
     time = np.arange(4000) / 200
@@ -179,6 +181,7 @@ def recorded(
     around = signal.butter(2, (7.0, 9.0), "bandpass", fs=200, output="sos")
     tau += ringing * signal.sosfilt(around, rng.standard_normal(len(time))) * 7
     tau += resonance * ringing_at(8.0, 200.0, np.sign(v))
+    tau += offset * (-1) ** seed
     tau += drift * np.cumsum(rng.standard_normal(len(time))) / np.sqrt(200)
     return jaxid.Recording.from_arrays(time, q[:, None], tau[:, None], name=name)
 
@@ -222,6 +225,13 @@ def test_the_floor_of_torque_that_drifts_is_its_error(drifting):
 
 def test_a_missing_effect_is_not_coloured_noise(lacking):
     fit, diagnosis, held_out = lacking
+    assert above_floors(fit, diagnosis, WORTH).all()
+    after = floor_with_coloured_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
+    assert after is diagnosis.measured
+
+
+def test_an_offset_that_differs_between_recordings_is_not_coloured_noise():
+    fit, diagnosis, held_out = diagnosed(offset=0.1)
     assert above_floors(fit, diagnosis, WORTH).all()
     after = floor_with_coloured_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)
     assert after is diagnosis.measured

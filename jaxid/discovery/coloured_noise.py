@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from ..estimate import Fit
 from ..noise import ARFilter
+from .changes import change_of
 from .comparison import Comparison
 from .dependence import ComparedRows, Dependence, among, on_others
 from .diagnosis import Diagnosis, over_recordings
@@ -60,8 +61,12 @@ def floor_with_coloured_noise(
     coloured = np.zeros(len(high), bool)
     for j in np.flatnonzero(high).tolist():
         free = 1 - min(float(over_recordings(low)[j] / over_recordings(left)[j]), 1.0) ** 2
-        coloured[j] = _independent(rows, unseen, j, noise[j]) and all(
-            _would_be_seen(rows, diagnosis, j, noise[j], free, rings) for rings in (False, True)
+        coloured[j] = (
+            change_of(chosen, diagnosis, j) is None
+            and _independent(rows, unseen, j, noise[j])
+            and all(
+                _would_be_seen(rows, diagnosis, j, noise[j], free, rings) for rings in (False, True)
+            )
         )
     return _raised(measured, left, low, coloured)
 
