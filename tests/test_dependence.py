@@ -11,6 +11,8 @@ from jaxid.control import Tracking
 from jaxid.discovery.coloured_noise import above_floors, floor_with_coloured_noise
 from jaxid.discovery.dependence import ComparedRows, among, depends_on_motion, on_others
 from jaxid.discovery.regressions import AT_ONCE, WITH_MEMORY
+from jaxid.discovery.remarks import remarks
+from jaxid.discovery.step import Step
 from jaxid.noise import ARFilter
 
 SLOW = ARFilter(np.array([-1.6, 0.62]), 1.0)
@@ -221,6 +223,9 @@ def test_the_floor_of_torque_that_drifts_is_its_error(drifting):
     changed = dataclasses.replace(diagnosis, measured=after)
     assert changed.floor_sources() == (("unpredicted",),)
     assert not above_floors(fit, changed, WORTH).any()
+    notes = remarks([Step("start", fit, held_out, changed)], fit.loop, {})
+    said = f"the error of joint 1 ({left.mean():.3g} %, and "
+    assert any(n.startswith(said) and "counts as noise" in n for n in notes)
 
 
 def test_a_missing_effect_is_not_coloured_noise(lacking):

@@ -7,12 +7,13 @@ import numpy as np
 from ..control import Tracking
 from ..effects import AbstractEffect, ActuatorLag, TimeDelay
 from ..estimate import Fit
+from ..estimate.result import joint_columns
 from ..estimate.standstill import slow_note
 from ..simulation.batch import motion_cutoff
 from ..simulation.loop import ClosedLoop
 from ..simulation.widening import LEAD
 from .alongside import LATE
-from .diagnosis import Diagnosis
+from .diagnosis import Diagnosis, over_recordings
 from .explore import DECISIVE
 from .hypotheses import amplitude_names, effect_on
 from .loose import DETERMINED
@@ -25,7 +26,7 @@ from .text import joined
 def remarks(
     steps: Sequence[Step], given: ClosedLoop, offsets: Mapping[str, AbstractEffect]
 ) -> tuple[str, ...]:
-    """Notes on failed fits, released values, offsets, bounds, slow motion and late drives.
+    """Notes on failed fits, released values, offsets, noise, bounds, slow motion and late drives.
 
     **Arguments:**
 
@@ -36,7 +37,7 @@ def remarks(
     said = [f"the fit of {', '.join(bad)} did not converge: use its values with care"]
     last = steps[-1].fit
     more = (*_estimated(last, given), *_delayed(last, given), *_instead(last, given, offsets))
-    more = (*more, *_uncertain(steps), *_out_of_bounds(steps[-1].diagnosis))
+    more = (*more, *_uncertain(steps), *_coloured(steps[-1]), *_out_of_bounds(steps[-1].diagnosis))
     more = (*more, *slow_note(given.standstill, last.loop), *looks_sampled(last))
     return (*(said if bad else ()), *more)
 
@@ -66,6 +67,23 @@ def _uncertain(steps: Sequence[Step]) -> list[str]:
                 "these recordings they can replace each other or other parameters"
             )
     return found
+
+
+def _coloured(last: Step) -> list[str]:
+    """A note on joints whose error counts as noise, although another noise floor is lower."""
+    floor = None if last.diagnosis is None else last.diagnosis.measured
+    if floor is None or not floor.coloured.any():
+        return []
+    columns = joint_columns(last.fit.loop.joints)
+    high, low = over_recordings(floor.percent), over_recordings(floor.low)
+    said = [
+        f"{columns[j]} ({high[j]:.3g} %, and {low[j]:.3g} % from the other noise floors)"
+        for j in np.flatnonzero(floor.coloured)
+    ]
+    return [
+        f"the error of {joined(said)} counts as noise, because the motion of other recordings "
+        "does not predict it: it may be slow noise, or torque that something else causes"
+    ]
 
 
 # Share of the residual that an effect out of its bounds must explain to be mentioned.

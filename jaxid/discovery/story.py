@@ -126,8 +126,11 @@ class Discovery(AbstractShown):
                 f"{best}{self.reason}."
             )
         if self.verdict == "adequate":
+            measured = self.diagnosis.measured
+            coloured = measured is not None and measured.coloured.any()
+            rest = "what does not depend on the motion" if coloured else "their noise"
             return (
-                f"The model of {self.loop.name} describes these recordings down to their noise: "
+                f"The model of {self.loop.name} describes these recordings down to {rest}: "
                 f"nothing is missing{self._sure()}."
             )
         if self.verdict == "explained":
