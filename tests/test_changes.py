@@ -49,7 +49,7 @@ def recorded(seed, offset=0.0, dry=1.0, gain=1.0, brake=0.0, slow=False):
 
 def diagnosed(*runs):
     fit = jaxid.fit(axis(), runs, jaxid.OEM(progress=False))
-    return fit, jaxid.diagnose(fit, catalogue=[Stribeck])
+    return jaxid.diagnose(fit, catalogue=[Stribeck])
 
 
 @pytest.mark.parametrize(
@@ -61,8 +61,8 @@ def diagnosed(*runs):
     ],
 )
 def test_a_value_that_differs_between_recordings_is_named(first, second, name, values):
-    fit, diagnosis = diagnosed(recorded(1, **first), recorded(2, **second))
-    said, share = changes(fit, diagnosis, WORTH)
+    diagnosis = diagnosed(recorded(1, **first), recorded(2, **second))
+    said, share = changes(diagnosis, WORTH)
     assert share > 0.8
     assert f"{name} differs between the recordings: " in said
     assert "find what changed, or fit the recordings separately" in said
@@ -74,32 +74,32 @@ def test_a_value_that_differs_between_recordings_is_named(first, second, name, v
 
 
 def test_friction_that_changes_during_recordings_is_named():
-    fit, diagnosis = diagnosed(recorded(1, brake=8.0), recorded(2, brake=5.0))
-    said, share = changes(fit, diagnosis, WORTH)
+    diagnosis = diagnosed(recorded(1, brake=8.0), recorded(2, brake=5.0))
+    said, share = changes(diagnosis, WORTH)
     assert share > 0.7
     assert said.startswith("Fc1 changes during the recordings: +")
-    change = change_of(fit, diagnosis, 0)
+    change = change_of(diagnosis, 0)
     assert change is not None
     # Twelfths of the recordings.
     assert change.part == (5, 3)
 
 
 def test_a_model_with_other_errors_is_compared_with_a_change():
-    fit, diagnosis = diagnosed(recorded(1, offset=1.0), recorded(2, offset=-0.5))
-    error = fit.error_percent.to_numpy().mean(axis=0)
-    change = change_of(fit, diagnosis, 0)
+    diagnosis = diagnosed(recorded(1, offset=1.0), recorded(2, offset=-0.5))
+    error = diagnosis.fit.error_percent.to_numpy().mean(axis=0)
+    change = change_of(diagnosis, 0)
     assert change is not None
     left = error * np.sqrt(1 - change.share)
-    assert changes(fit, diagnosis, WORTH, 1.5 * left)[1] == pytest.approx(1 - 1 / 1.5**2, abs=0.01)
+    assert changes(diagnosis, WORTH, 1.5 * left)[1] == pytest.approx(1 - 1 / 1.5**2, abs=0.01)
     # Effects that explain as much.
-    assert changes(fit, diagnosis, WORTH, 1.05 * left) == ("", 0.0)
+    assert changes(diagnosis, WORTH, 1.05 * left) == ("", 0.0)
 
 
 def test_slow_noise_is_no_change():
     """The tests of five pairs of recordings; a p-value is below 0.005 if a change is found."""
     for seed in range(5):
         pair = diagnosed(recorded(10 + seed, slow=True), recorded(20 + seed, slow=True))
-        assert changes(*pair, WORTH) == ("", 0.0)
+        assert changes(pair, WORTH) == ("", 0.0)
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..estimate import Fit
 from ..estimate.result import joint_columns
 from .diagnosis import Diagnosis, over_recordings
 from .relevance import allowed
@@ -90,10 +89,7 @@ class Change(eqx.Module):
 
 
 def changes(
-    fit: Fit,
-    diagnosis: Diagnosis,
-    worth: float,
-    chosen: Float[np.ndarray, " joints"] | None = None,
+    diagnosis: Diagnosis, worth: float, chosen: Float[np.ndarray, " joints"] | None = None
 ) -> tuple[str, float]:
     """What is not the same throughout the recordings, and its share of a joint's squared error.
 
@@ -101,19 +97,18 @@ def changes(
 
     **Arguments:**
 
-    - `fit`: of a model. `diagnosis`: of this fit, or of one of the same model with other values.
     - `worth`: smallest relevant change, in % of a joint's torque.
-    - `chosen`: errors of the final model by joint, %, if it is another one than that of the fit.
+    - `chosen`: errors of the final model by joint, %, if it is not the one of the diagnosis.
     """
-    joints, data = fit.loop.joints, diagnosis.data
-    if len(fit.recordings) != len(data.residual) or fit.loop.controller.judged != "torque":
-        # Windows have no names.
+    fit, joints = diagnosis.fit, diagnosis.fit.loop.joints
+    windows = len(fit.recordings) != len(diagnosis.data.residual)
+    if windows or fit.loop.controller.judged != "torque":
         return "", 0.0
     own, least = over_recordings(fit.error_percent.to_numpy()), allowed(fit.loop, worth)[1]
     error = own if chosen is None else chosen
     found = []
     for j in range(joints):
-        change = change_of(fit, diagnosis, j)
+        change = change_of(diagnosis, j)
         left = np.inf if change is None else own[j] * np.sqrt(max(1 - change.share, 0.0))
         share = 1 - (left / max(error[j], 1e-300)) ** 2
         if change is not None and share > _SHARE and error[j] * np.sqrt(share) > least:
@@ -130,12 +125,12 @@ def changes(
     return said, share
 
 
-def change_of(fit: Fit, diagnosis: Diagnosis, joint: int) -> Change | None:
+def change_of(diagnosis: Diagnosis, joint: int) -> Change | None:
     """The change that explains most of a joint's residual, if it explains more than of noise.
 
     **Arguments:**
 
-    - `fit`, `diagnosis`: as for `changes`. `joint`: from 0.
+    - `joint`: from 0.
     """
     rows = Rows.of(diagnosis, joint)
     count = len(rows.residual)
@@ -147,7 +142,7 @@ def change_of(fit: Fit, diagnosis: Diagnosis, joint: int) -> Change | None:
     series = rows.without_base(np.column_stack([rows.residual, draws.T]))
     series /= np.maximum(np.linalg.norm(series, axis=0), 1e-300)
     found, most = [], np.zeros(_DRAWS)
-    for value in _values(fit, diagnosis, joint):
+    for value in _values(diagnosis, joint):
         for part, shares in _explained(rows, value, series):
             found.append(Change(value, part, float(shares[0])))
             most = np.maximum(most, shares[1:])
@@ -179,14 +174,14 @@ def _explained(
         yield tuple(chosen[0].tolist()), np.einsum("si,sij,sj->s", along, inverse, along)
 
 
-def _values(fit: Fit, diagnosis: Diagnosis, joint: int) -> Iterable[Value]:
+def _values(diagnosis: Diagnosis, joint: int) -> Iterable[Value]:
     """The values of a joint (from 0) that may change: of its friction and motor, and a gain."""
-    there, place = diagnosis.data.there[..., joint], 0
-    for p in fit.loop.free_parameters:
+    loop, there, place = diagnosis.fit.loop, diagnosis.data.there[..., joint], 0
+    for p in loop.free_parameters:
         own = p.place[0] == "effects" and p.joint == joint + 1
         if own and p.declaration.linear and p.size == 1:
             slope = diagnosis.data.base[:, :, joint, place][there]
-            estimate = float(p.where(fit.loop))
+            estimate = float(p.where(loop))
             yield Value(p.name, p.declaration.unit, estimate, place, slope)
         place += p.size
     torque = np.asarray(diagnosis.motion.tau)[..., joint][there]

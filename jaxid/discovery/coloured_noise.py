@@ -62,7 +62,7 @@ def floor_with_coloured_noise(
     for j in np.flatnonzero(high).tolist():
         free = 1 - min(float(over_recordings(low)[j] / over_recordings(left)[j]), 1.0) ** 2
         coloured[j] = (
-            change_of(chosen, diagnosis, j) is None
+            change_of(diagnosis, j) is None
             and _independent(rows, unseen, j, noise[j])
             and all(
                 _would_be_seen(rows, diagnosis, j, noise[j], free, rings) for rings in (False, True)

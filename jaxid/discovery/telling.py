@@ -76,22 +76,28 @@ def told(
         steps = _without_probabilities(steps) if reason else steps
     if not interrupted and (change := _changed(search, steps, verdict, reason)):
         steps, reason = _without_probabilities(steps), change
-    notes = (*remarks(steps, search.given, search.offsets), *search.failures)
-    notes = (*notes, *_not_examined(search))
-    notes = (*_without_recordings(search.asked.recordings, steps[0].fit), *notes)
-    if unfinished and reason != short:
-        notes = (short, *notes)
+    notes = (short,) if unfinished and reason != short else ()
     return Discovery(
         verdict="undetermined" if reason else verdict,
         reason=reason,
         steps=tuple(steps),
         considered=worth_keeping(models),
         removed=search.removed,
-        notes=notes,
+        notes=(*notes, *_notes(search, steps)),
         seconds=time.perf_counter() - started,
         unfinished=unfinished,
         interrupted=interrupted,
     )
+
+
+def _notes(search: Search, steps: Sequence[Step]) -> list[str]:
+    """What a user should know beside the verdict."""
+    return [
+        *_without_recordings(search.asked.recordings, steps[0].fit),
+        *remarks(steps, search.given, search.offsets),
+        *search.failures,
+        *_not_examined(search),
+    ]
 
 
 def _changed(search: Search, steps: Sequence[Step], verdict: Outcome, reason: str) -> str:
@@ -111,7 +117,7 @@ def _changed(search: Search, steps: Sequence[Step], verdict: Outcome, reason: st
     for step in (last, *steps[:-1][:1]):
         sound = step.fit.status is Status.converged and not step.fit.mistake
         if step.diagnosis is not None and sound:
-            found.append(changes(step.fit, step.diagnosis, worth, error))
+            found.append(changes(step.diagnosis, worth, error))
     said, share = max(found, key=lambda x: x[1])
     if share > _MOST if reason else verdict != "outside_catalogue":
         return said
