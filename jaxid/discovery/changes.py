@@ -26,7 +26,7 @@ _SHARE, _DRAWS = 0.2, 200
 _PARTS = 12
 
 
-class Value(eqx.Module):
+class JointValue(eqx.Module):
     """A value of a joint that may change.
 
     - `estimate`: with one value for all recordings. `place`: among the parameters; None if the
@@ -41,7 +41,7 @@ class Value(eqx.Module):
     slope: Float[np.ndarray, " rows"]
 
 
-class Rows(eqx.Module):
+class JointRows(eqx.Module):
     """The compared rows of one joint, one recording after the other.
 
     - `residual`: N·m or N. `base`: what the model's own values change; `basis`: the same,
@@ -57,7 +57,7 @@ class Rows(eqx.Module):
     ends: Float[np.ndarray, "recordings parts"]
 
     @classmethod
-    def of(cls, diagnosis: Diagnosis, joint: int) -> "Rows":
+    def of(cls, diagnosis: Diagnosis, joint: int) -> "JointRows":
         """The rows of a joint (from 0)."""
         data, there = diagnosis.data, diagnosis.data.there[..., joint]
         number, time = np.nonzero(there)[0], np.asarray(diagnosis.motion.t)[there]
@@ -76,14 +76,14 @@ class Rows(eqx.Module):
         return x - self.basis @ (self.basis.T @ x)
 
 
-class Change(eqx.Module):
+class Variation(eqx.Module):
     """A value that is not the same throughout the recordings.
 
     - `part`: number of the part of each recording in which it is another one; zero for the whole.
     - `share`: part of the joint's squared residual that it explains.
     """
 
-    value: Value
+    value: JointValue
     part: tuple[int, ...]
     share: float
 
@@ -116,23 +116,23 @@ def changes(
     if not found:
         return "", 0.0
     _, share, left, j, change = max(found, key=lambda x: x[0])
+    what = _told(change, JointRows.of(diagnosis, j), fit.recordings.names)
     said = (
-        f"{_told(change, Rows.of(diagnosis, j), fit.recordings.names)}; with this the error of "
-        f"{joint_columns(joints)[j]} on the fitted recordings is {left:.3g} % instead of "
-        f"{error[j]:.3g} %, but a model has one value: find what changed, or fit the recordings "
-        "separately"
+        f"{what}; with this the error of {joint_columns(joints)[j]} on the fitted recordings is "
+        f"{left:.3g} % instead of {error[j]:.3g} %, but a model has one value: find what changed, "
+        "or fit the recordings separately"
     )
     return said, share
 
 
-def change_of(diagnosis: Diagnosis, joint: int) -> Change | None:
+def change_of(diagnosis: Diagnosis, joint: int) -> Variation | None:
     """The change that explains most of a joint's residual, if it explains more than of noise.
 
     **Arguments:**
 
     - `joint`: from 0.
     """
-    rows = Rows.of(diagnosis, joint)
+    rows = JointRows.of(diagnosis, joint)
     count = len(rows.residual)
     if count <= 2 * rows.basis.shape[1]:
         return None
@@ -144,14 +144,14 @@ def change_of(diagnosis: Diagnosis, joint: int) -> Change | None:
     found, most = [], np.zeros(_DRAWS)
     for value in _values(diagnosis, joint):
         for part, shares in _explained(rows, value, series):
-            found.append(Change(value, part, float(shares[0])))
+            found.append(Variation(value, part, float(shares[0])))
             most = np.maximum(most, shares[1:])
     best = max(found, key=lambda c: c.share)
     return best if best.share > max(_SHARE, float(most.max())) else None
 
 
 def _explained(
-    rows: Rows, value: Value, series: Float[np.ndarray, "rows series"]
+    rows: JointRows, value: JointValue, series: Float[np.ndarray, "rows series"]
 ) -> Iterable[tuple[tuple[int, ...], Float[np.ndarray, " series"]]]:
     """The shares of series that a value explains, if it differs between recordings or during them.
 
@@ -174,7 +174,7 @@ def _explained(
         yield tuple(chosen[0].tolist()), np.einsum("si,sij,sj->s", along, inverse, along)
 
 
-def _values(diagnosis: Diagnosis, joint: int) -> Iterable[Value]:
+def _values(diagnosis: Diagnosis, joint: int) -> Iterable[JointValue]:
     """The values of a joint (from 0) that may change: of its friction and motor, and a gain."""
     loop, there, place = diagnosis.fit.loop, diagnosis.data.there[..., joint], 0
     for p in loop.free_parameters:
@@ -182,14 +182,14 @@ def _values(diagnosis: Diagnosis, joint: int) -> Iterable[Value]:
         if own and p.declaration.linear and p.size == 1:
             slope = diagnosis.data.base[:, :, joint, place][there]
             estimate = float(p.where(loop))
-            yield Value(p.name, p.declaration.unit, estimate, place, slope)
+            yield JointValue(p.name, p.declaration.unit, estimate, place, slope)
         place += p.size
     torque = np.asarray(diagnosis.motion.tau)[..., joint][there]
     name = f"the ratio of measured and modelled torque of joint {joint + 1}"
-    yield Value(name, "1", 1.0, None, torque)
+    yield JointValue(name, "1", 1.0, None, torque)
 
 
-def _told(change: Change, rows: Rows, names: Sequence[str]) -> str:
+def _told(change: Variation, rows: JointRows, names: Sequence[str]) -> str:
     """The change in words."""
     value, each = change.value, range(len(names))
     where = np.stack([rows.parts[:, k, change.part[k]] for k in each], axis=1)
