@@ -1,6 +1,7 @@
 """Loops of the independent simulator's arms, and its recordings, for the tests of simulation."""
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cache
 
 import equinox as eqx
@@ -104,3 +105,21 @@ class QuadraticDrag(AbstractEffect):
         """On its joint."""
         v = motion.v[self.joint - 1]
         return on_joint(self.joint, self.drag * v * jnp.abs(v), motion)
+
+
+def sines(
+    time: np.ndarray, sizes: Sequence[float], frequencies: Sequence[float], phases: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position, velocity and acceleration of a sum of sines, `(samples,)` each.
+
+    **Arguments:**
+
+    - `time`: s. `sizes`: rad or m. `frequencies`: Hz. `phases`: rad.
+    """
+    rates = 2 * np.pi * np.asarray(frequencies)
+
+    def motion(order: int) -> np.ndarray:
+        turned = time[:, None] * rates + phases + order * np.pi / 2
+        return (np.asarray(sizes) * rates**order * np.sin(turned)).sum(axis=1)
+
+    return motion(0), motion(1), motion(2)

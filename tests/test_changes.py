@@ -5,6 +5,7 @@ Torque is that of inverse dynamics written out here, along motions in closed for
 
 import numpy as np
 import pytest
+from loops import sines
 
 import jaxid
 from jaxid.control import Tracking
@@ -33,14 +34,8 @@ def recorded(seed, offset=0.0, dry=1.0, gain=1.0, brake=0.0, slow=False):
     """
     rng = np.random.default_rng(seed)
     time = np.arange(0.0, 20.0, 0.01)
-    rates, phases = 2 * np.pi * np.array([0.21, 0.53, 1.1]), rng.uniform(0, 6, 3)
-    sizes = np.array([0.2, 0.07, 0.02])
-
-    def motion(order):
-        turned = time[:, None] * rates + phases + order * np.pi / 2
-        return (sizes * rates**order * np.sin(turned)).sum(axis=1)
-
-    q, v, a = map(motion, range(3))
+    frequencies = (0.21, 0.53, 1.1)
+    q, v, a = sines(time, (0.2, 0.07, 0.02), frequencies, rng.uniform(0, 6, 3))
     held = dry + 0.5 * (time < brake)
     tau = gain * (MASS * a + DRAG * v + held * DRY * np.tanh(v / 0.02) + offset)
     tau += SLOW.simulate((len(time),), rng) if slow else 0.1 * rng.standard_normal(len(time))

@@ -8,6 +8,7 @@ import dataclasses
 import independent as sim
 import numpy as np
 import pytest
+from loops import sines
 
 import jaxid
 from jaxid.control import Tracking
@@ -31,14 +32,8 @@ RATE, DEVIATION = 200.0, 2e-5
 def recorded(rng, deviation=DEVIATION, step=0.0, samples=2400):
     """An axis whose encoder has white noise, or steps."""
     time = np.arange(samples) / RATE
-    rates, phases = 2 * np.pi * np.array([0.2, 0.5, 1.3]), rng.uniform(0, 6, 3)
-    sizes = np.array([0.2, 0.08, 0.02])
-
-    def motion(order):
-        turned = time[:, None] * rates + phases + order * np.pi / 2
-        return (sizes * rates**order * np.sin(turned)).sum(axis=1)
-
-    q, v, a = map(motion, range(3))
+    frequencies = (0.2, 0.5, 1.3)
+    q, v, a = sines(time, (0.2, 0.08, 0.02), frequencies, rng.uniform(0, 6, 3))
     tau = MASS * a + DRAG * v + DRY * 2 / np.pi * np.arctan(v / 0.01)
     tau = tau + 0.1 * rng.standard_normal(samples)
     q = q + deviation * rng.standard_normal(samples)

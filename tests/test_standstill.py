@@ -7,6 +7,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from loops import sines
 
 import jaxid
 from jaxid import Standstill
@@ -33,14 +34,8 @@ def recorded(seed, friction, size=1.0):
     """
     rng = np.random.default_rng(seed)
     time = np.arange(0.0, 20.0, 0.002)
-    rates, phases = 2 * np.pi * np.array([0.11, 0.33, 0.7]), rng.uniform(0, 6, 3)
-    sizes = size * np.array([0.2, 0.07, 0.01])
-
-    def motion(order):
-        turned = time[:, None] * rates + phases + order * np.pi / 2
-        return (sizes * rates**order * np.sin(turned)).sum(axis=1)
-
-    q, v, a = map(motion, range(3))
+    frequencies = (0.11, 0.33, 0.7)
+    q, v, a = sines(time, size * np.array([0.2, 0.07, 0.01]), frequencies, rng.uniform(0, 6, 3))
     tau = MASS * a + DRAG * v + friction(time, q, v) + 0.05 * rng.standard_normal(len(time))
     return jaxid.Recording.from_arrays(time, q, tau, name=f"run_{seed}")
 

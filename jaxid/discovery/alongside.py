@@ -118,23 +118,28 @@ def approximating(steps: Sequence[Step], along: Sequence[Step]) -> tuple[Abstrac
     if len(kept) >= len(others):
         return ()
     gone = [s for s in others if s.added is not None and form(s.added) not in kept]
-    doubtful = (s.unseen in ("unchanged", "raises") or _contradicted(along[-1], s) for s in gone)
-    return tuple(s.added for s in gone if s.added is not None) if all(doubtful) else ()
+    possible = [
+        s.added for s in gone if s.added is not None and s.unseen in (None, "lowers", "mixed")
+    ]
+    if possible and not _contradicted(along[-1], possible):
+        return ()
+    return tuple(s.added for s in gone if s.added is not None)
 
 
-def _contradicted(along: Step, step: Step) -> bool:
-    """Whether a model without the law is worse with the effect of a step, all else estimated again.
+def _contradicted(along: Step, effects: Sequence[AbstractEffect]) -> bool:
+    """Whether a model without the law is worse with each effect at its values.
 
-    A transmission has a motion of its own, which the recorded motion does not give.
+    All other values are estimated again. A transmission has a motion of its own, which the recorded
+    motion does not give.
     """
     assert along.diagnosis is not None
-    if step.added is None or isinstance(step.added, AbstractTransmission):
+    if any(isinstance(e, AbstractTransmission) for e in effects):
         return False
     data, noise = along.diagnosis.data, along.diagnosis.noise
     predictor = Predictor.of(System.of(along.fit), noise, data.level)
-    without, there = predictor.predict(()), predictor.predict((step.added,), steps=1)
-    rows = int(predictor.data.compared.sum())
-    return bool(rows * np.log(there.loss / without.loss) > DECISIVE)
+    rows, without = int(predictor.data.compared.sum()), predictor.predict(()).loss
+    losses = [predictor.predict((e,), steps=1).loss for e in effects]
+    return all(rows * np.log(loss / without) > DECISIVE for loss in losses)
 
 
 def _late(given: ClosedLoop, effects: Sequence[AbstractEffect], period: float) -> tuple[float, ...]:

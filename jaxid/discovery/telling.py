@@ -114,7 +114,7 @@ def _changed(search: Search, steps: Sequence[Step], verdict: Outcome, reason: st
     last, worth = steps[-1], search.asked.worth
     error = over_recordings(last.fit.error_percent.to_numpy())
     found = [("", 0.0)]
-    for step in (last, *steps[:-1][:1]):
+    for step in (last, steps[0])[: len(steps)]:
         sound = step.fit.status is Status.converged and not step.fit.mistake
         if step.diagnosis is not None and sound:
             found.append(changes(step.diagnosis, worth, error))

@@ -280,6 +280,10 @@ def _compared_rows(recording: Recording, cutoff: float) -> Int[np.ndarray, " row
 
     In a gap longer than half a period of the cutoff the motion is not known, so a gap has two ends.
 
+    **Arguments:**
+
+    - `cutoff`: of the low-pass, Hz.
+
     **Raises:** `RecordingError` if there are fewer than ten.
     """
     time, settling = recording.time, _ENDS / cutoff
