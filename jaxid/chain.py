@@ -11,6 +11,7 @@ from .parameters import as_float64
 # Names of a body's ten parameters (Khalil, Dombre 2002), without the link's number: inertia about
 # the origin of the link's frame, first moment, mass.
 BODY = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
+BODY_UNITS = ("kg·m²",) * 6 + ("kg·m",) * 3 + ("kg",)
 
 
 class Chain(eqx.Module):

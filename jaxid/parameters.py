@@ -68,7 +68,7 @@ def parameter(
 
     - `default`: value if none is given, in `unit`.
     - `symbol`: its name in the literature, without the joint (`"Fv"`).
-    - `unit`: SI unit as shown in tables.
+    - `unit`: SI unit as shown in tables; empty if the values have units of their own.
     - `lower`, `upper`: bounds of estimates.
     - `scale`: typical size.
     - `free`: whether a fit estimates it by default.
@@ -91,7 +91,8 @@ class Parameter(eqx.Module):
     """One parameter of a model: its declaration, its unique name and its place in the model.
 
     A field that holds several values (the coefficients of a curve) is one parameter with `size`
-    above one. Its values are named by number, or by the `labels` in the owner's `field_names`.
+    above one. Its values are named by number, or by the `labels` in the owner's `field_names`. They
+    have the declared unit, or the `units` in the owner's `field_units`.
     """
 
     name: str = eqx.field(static=True)
@@ -101,6 +102,7 @@ class Parameter(eqx.Module):
     size: int = eqx.field(static=True, default=1)
     several: bool = eqx.field(static=True, default=False)
     labels: tuple[str, ...] = eqx.field(static=True, default=())
+    units: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def place(self) -> Place:
@@ -177,7 +179,8 @@ def _listed(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Parame
         taken.add(name)
         size, several = math.prod(value.shape), bool(value.shape)
         labels = tuple(getattr(owner, f"{field}_names", ()))
-        found.append(Parameter(name, declaration, where, joint, size, several, labels))
+        units = tuple(getattr(owner, f"{field}_units", (declaration.unit,) * size))
+        found.append(Parameter(name, declaration, where, joint, size, several, labels, units))
     return tuple(found)
 
 

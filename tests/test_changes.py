@@ -97,6 +97,17 @@ def test_slow_noise_is_no_change():
         assert changes(pair, WORTH) == ("", 0.0)
 
 
+def test_a_missing_effect_in_a_short_slow_motion_is_no_change():
+    """A missing weight resembles an offset that changes once, if it swings once."""
+    time = np.arange(0.0, 10.0, 0.01)
+    q, v, a = sines(time, (0.6, 0.05, 0.02), (0.1, 0.53, 1.1), np.array([0.3, 1.0, 2.0]))
+    tau = MASS * a + DRAG * v + DRY * np.tanh(v / 0.02) + 2.0 * np.sin(2 * q)
+    tau += 0.05 * np.random.default_rng(0).standard_normal(len(time))
+    diagnosis = diagnosed(jaxid.Recording.from_arrays(time, q, tau, name="slow"))
+    assert diagnosis.fit.error_percent.to_numpy().min() > 20
+    assert change_of(diagnosis, 0) is None
+
+
 @pytest.mark.slow
 def test_a_discovery_tells_what_differs():
     runs = recorded(1, offset=1.0), recorded(2, offset=-0.5)

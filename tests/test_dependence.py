@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy import signal
+from stories import recordings_of
 
 import jaxid
 from jaxid.control import Tracking
@@ -13,6 +14,7 @@ from jaxid.discovery.dependence import ComparedRows, among, depends_on_motion, o
 from jaxid.discovery.regressions import AT_ONCE, WITH_MEMORY
 from jaxid.discovery.remarks import remarks
 from jaxid.discovery.step import Step
+from jaxid.effects import Stribeck
 from jaxid.noise import ARFilter
 
 SLOW = ARFilter(np.array([-1.6, 0.62]), 1.0)
@@ -267,3 +269,19 @@ def test_an_effect_of_no_known_formula_is_told_from_other_recordings(lacking):
     assert alone.startswith("on the fitted recordings")
     # What the user does not find worth knowing is not told.
     assert depends_on_motion(fit, diagnosis, diagnosis.noise, held_out, 50.0) == ""
+
+
+@pytest.mark.xdist_group("offset")
+def test_windows_of_a_fit_are_tested_like_recordings(offset_case):
+    fitted, unseen = recordings_of(offset_case)
+    fit = jaxid.fit(jaxid.scara(), fitted, jaxid.OEM(window=4.0, progress=False))
+    diagnosis = jaxid.diagnose(fit, catalogue=[Stribeck], progress=False)
+    rows = ComparedRows.of_fit(fit, diagnosis)
+    assert len(rows.residual) > len(fit.residuals)
+    assert [len(x) for x in rows.motion] == [len(x) for x in rows.residual]
+    total = sum(np.sum(r**2) for r in rows.residual)
+    assert total == pytest.approx(sum(np.sum(r**2) for r in fit.residuals), rel=0.02)
+    for held_out in (None, jaxid.compare(fit, unseen)):
+        said = depends_on_motion(fit, diagnosis, diagnosis.noise, held_out, WORTH)
+        assert isinstance(said, str)
+        floor_with_coloured_noise(fit, diagnosis, diagnosis.noise, held_out, WORTH)

@@ -1,5 +1,7 @@
 """An effect's own curve, against its formula and what recordings of another simulator leave."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -67,6 +69,38 @@ def test_friction_that_varies_with_position_is_shown_over_position():
     inside = np.abs(found.x) < 1.0
     size = np.abs(expected).max()
     assert found.torque[inside] == pytest.approx(np.array(expected)[inside], abs=0.1 * size)
+
+
+@pytest.mark.parametrize("kind", ["by load", "with a lead"])
+def test_what_an_effect_is_told_of_the_loop_is_told_to_its_curve(kind):
+    """Friction by the load of a spring, and friction that is ahead of the recorded motion."""
+    t = np.linspace(0, 20, 2001)
+    q = 0.5 * np.sin(1.3 * t) + 0.1 * np.sin(4.1 * t)
+    v, a = (np.gradient(np.gradient(q, t), t), np.gradient(q, t))[::-1]
+    # The torque that passes the gear is 95 a + 300 q and the friction; 300 q is the load.
+    ratio, lead, stiffness = 0.1, 0.02, 300.0
+    link = 95.0 * a + stiffness * q
+    both = (link + stiffness * q) / (1 - ratio * np.sign(v) * np.sign(link + stiffness * q))
+    friction = ratio * np.abs(both) * np.sign(v)
+    if kind == "with a lead":
+        friction = 20.0 * np.sign(v + lead * a)
+    force = link + friction
+    record = jaxid.Recording.from_arrays(t, q, force, q_ref=q, name="one")
+    loop = jaxid.emps(jaxid.control.Tracking()).add(
+        jaxid.effects.Spring(joint=1, stiffness=stiffness)
+    )
+    if kind == "by load":
+        loop = loop.add(jaxid.effects.GearFriction(joint=1, drive=ratio))
+        found = effect_curve(jaxid.fit(loop, record, jaxid.OEM(progress=False)), "gear_friction")
+        assert found.share > 0.8
+        # Largest at the ends of the travel, where the spring is stretched most.
+        assert np.abs(found.torque).max() == pytest.approx(np.abs(friction).max(), rel=0.15)
+        return
+    fit = jaxid.fit(loop.with_values(lead1=lead), record, jaxid.OEM(progress=False))
+    found = effect_curve(fit, "coulomb")
+    still = effect_curve(dataclasses.replace(fit, loop=fit.loop.with_values(lead1=0.0)), "coulomb")
+    # Near a reversal the friction has changed its direction before the velocity has.
+    assert np.abs(found.torque - np.interp(found.x, still.x, still.torque)).max() > 5.0
 
 
 @pytest.mark.xdist_group("offset")

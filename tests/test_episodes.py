@@ -4,9 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+from loops import sines
 
+import jaxid
+from jaxid.arms import Axis
 from jaxid.control import Tracking
-from jaxid.discovery.episodes import in_episodes
+from jaxid.discovery.coloured_noise import floor_with_coloured_noise
+from jaxid.discovery.episodes import episode_of, in_episodes, in_one_episode
+from jaxid.effects import Coulomb, Stribeck, TorqueOffset, Viscous
 
 
 @pytest.mark.xdist_group("offset")
@@ -40,3 +45,48 @@ def test_noise_may_have_heavy_tails_and_bursts(kind, offset_story):
 
     fit = dataclasses.replace(fit, residuals=tuple(noise(np.asarray(r)) for r in fit.residuals))
     assert in_episodes(fit, 0.05) == ""
+
+
+def pushed(seed: int, push: float = 0.0, noise: str = "white") -> jaxid.Recording:
+    """An axis for 20 s at 100 Hz that is pushed from 7.2 to 8.8 s.
+
+    **Arguments:**
+
+    - `push`: largest force, N. `noise`: white, or with bursts.
+    """
+    rng, time = np.random.default_rng(seed), np.arange(0.0, 20.0, 0.01)
+    q, v, a = sines(time, (0.2, 0.07, 0.02), (0.21, 0.53, 1.1), rng.uniform(0, 6, 3))
+    tau = 5.0 * a + 4.0 * v + 3.0 * np.tanh(v / 0.02)
+    inside = (time > 7.2) & (time < 8.8)
+    tau -= push * inside * np.sin(np.pi * (time - 7.2) / 1.6) ** 2
+    loud = np.repeat(rng.random(len(time) // 50) < 0.1, 50) if noise == "bursts" else False
+    tau += 0.1 * np.where(loud, 4.0, 1.0) * rng.standard_normal(len(time))
+    return jaxid.Recording.from_arrays(time, q, tau, name=f"run_{seed}")
+
+
+def diagnosed(*runs: jaxid.Recording) -> jaxid.discovery.Diagnosis:
+    effects = Viscous(1, 1.0), Coulomb(1, 1.0, smoothing=0.02), TorqueOffset(1)
+    loop = jaxid.ClosedLoop(Axis(M=4.0), Tracking(cutoff=10.0), effects, name="axis")
+    fit = jaxid.fit(loop, runs, jaxid.OEM(progress=False))
+    return jaxid.diagnose(fit, catalogue=[Stribeck])
+
+
+def test_a_push_in_one_recording_is_found_and_is_no_noise():
+    diagnosis = diagnosed(pushed(1, push=6.0), pushed(2))
+    found = episode_of(diagnosis, 0)
+    assert found is not None
+    assert found.recording == 0
+    assert (found.start, found.end) == pytest.approx((7.2, 8.8), abs=0.3)
+    said = in_one_episode(diagnosis, 0.05)
+    assert said.startswith("on run_1 the error of joint 1 is ")
+    assert f"from {found.start:.3g} to {found.end:.3g} s" in said
+    # What the user does not find worth knowing is no reason.
+    assert in_one_episode(diagnosis, 100.0) == ""
+    floor = floor_with_coloured_noise(diagnosis.fit, diagnosis, diagnosis.noise, None, 0.05)
+    assert floor is diagnosis.measured
+
+
+@pytest.mark.parametrize("noise", ["white", "bursts"])
+def test_noise_is_no_single_episode(noise):
+    for seed in range(3, 7):
+        assert episode_of(diagnosed(pushed(seed, noise=noise), pushed(10 + seed)), 0) is None

@@ -135,7 +135,7 @@ def test_units_of_joints_that_slide():
     assert sliding_unit("rad/(N·m)") == "m/N"
     assert sliding_unit("N·m/(rad/s)") == "N/(m/s)"
     loop = jaxid.emps()
-    units = {p.name: loop.unit(p) for p in loop.parameters}
+    units = {p.name: unit for p in loop.parameters for unit in loop.units(p)}
     assert units == {
         "M": "kg",
         "Fv1": "N·s/m",
@@ -145,7 +145,7 @@ def test_units_of_joints_that_slide():
         "lead1": "s",
         "offset1": "N",
     }
-    assert jaxid.scara().unit(jaxid.scara().parameters[4]) == "N·m·s/rad"
+    assert jaxid.scara().units(jaxid.scara().parameters[4]) == ("N·m·s/rad",)
 
 
 # --- reading and writing ----------------------------------------------------------------------

@@ -199,6 +199,12 @@ def test_the_first_format_stays_readable() -> None:
     assert jaxid.compare(fit, fit.recordings).errors.shape == (3, 1)
 
 
+def test_a_field_of_older_diagnoses_is_dropped() -> None:
+    kept = {"tests": 3.0}
+    assert jaxid.discovery.Diagnosis.fields_of_format({"pair": (), **kept}, 4) == kept
+    assert jaxid.discovery.Diagnosis.fields_of_format(kept, archive.FORMAT) == kept
+
+
 def test_it_opens_without_jaxid(tmp_path: Path, small_fit: jaxid.Fit) -> None:
     small_fit.save(tmp_path / "fit.jaxid")
     with np.load(tmp_path / "fit.jaxid") as arrays:

@@ -179,6 +179,10 @@ def test_base_parameters_say_what_they_are():
     loop = jaxid.serial(POLAR, bodies="free").with_values(**{arm.base_names[0]: 0.7})
     assert float(loop.arm.base[0]) == 0.7
     assert set(arm.base_names) <= set(loop.names)
+    own = {"XX": "kg·m²", "YY": "kg·m²", "ZZ": "kg·m²", "MX": "kg·m", "MY": "kg·m", "M": "kg"}
+    base = next(p for p in loop.parameters if p.names == list(arm.base_names))
+    for name, unit in zip(base.names, loop.units(base), strict=True):
+        assert unit == own["M" if name[1:2].isdigit() else name[:2]], name
 
 
 def test_bodies_that_no_motion_shows_do_not_matter():

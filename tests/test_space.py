@@ -125,6 +125,7 @@ def test_a_carried_body_loads_the_joints_as_one_welded_to_pinocchios_arm(arm):
         recordings=("with", "also with"),
     )
     np.testing.assert_allclose(effect.centre(), tip + centre, atol=1e-15)
+    assert effect.rest_units == ("kg·m²",) * 6 + ("kg·m",) * 3
     ours = torque(effect, q, v, a, "with")
     np.testing.assert_allclose(ours, loaded - empty, atol=1e-12 * np.abs(loaded).max())
     assert np.all(torque(effect, q, v, a, "without") == 0)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..chain import BODY, Chain
+from ..chain import BODY, BODY_UNITS, Chain
 from ..parameters import KNOWN, Vector, as_float64, parameter
 from ._serial import AbstractSerialArm
 from .base_parameters import base_parameters, random_regressor
@@ -38,7 +38,7 @@ class SerialArm(AbstractSerialArm):
     lower: tuple[float, ...] = eqx.field(static=True)
     upper: tuple[float, ...] = eqx.field(static=True)
     gears: tuple[tuple[float, ...], ...] | None = eqx.field(static=True, default=None)
-    base: Vector = parameter(None, symbol="base", unit="SI", scale=1.0)
+    base: Vector = parameter(None, symbol="base", unit="", scale=1.0)
     leading: tuple[int, ...] = eqx.field(static=True, default=())
     base_names: tuple[str, ...] = eqx.field(static=True, default=())
     combined: Float[Array, "base parameters"] = eqx.field(converter=as_float64, default=None)
@@ -63,6 +63,11 @@ class SerialArm(AbstractSerialArm):
         place = {leading: k for k, leading in enumerate(self.leading)}
         numbers = [x + changed[place[k]] if k in place else x for k, x in enumerate(drawn)]
         return jnp.stack(numbers).reshape(self.bodies.shape)
+
+    @property
+    def base_units(self) -> tuple[str, ...]:
+        """Units of the base parameters: those of their leading parameters."""
+        return tuple(BODY_UNITS[k % len(BODY)] for k in self.leading)
 
     def combinations(self) -> dict[str, str]:
         """Each base parameter as a sum of link parameters."""

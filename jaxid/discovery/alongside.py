@@ -231,7 +231,9 @@ def _beside(
     inverse = np.linalg.pinv(slopes.T @ slopes)
     alone = np.array([float(e.delay) for e in late.effects if isinstance(e, TimeDelay)])
     found = alone + inverse @ (slopes.T @ late.residual)
-    return found, np.sqrt(np.diag(inverse) * (rest @ rest) / len(rest))
+    # Rows that are not compared are zero.
+    freedom = np.count_nonzero(late.residual) - late.freedom - others.shape[1]
+    return found, np.sqrt(np.diag(inverse) * (rest @ rest) / max(freedom, 1))
 
 
 def in_the_loop(loop: ClosedLoop, models: Sequence[ClosedLoop], recordings: Recordings) -> str:

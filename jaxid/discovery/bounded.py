@@ -5,7 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .score import WEAK
+from .data import places_among
+from .hypotheses import Hypothesis
+from .score import WEAK, Gram
 
 
 def least_squares(
@@ -67,3 +69,15 @@ def bounded_amplitudes(
     explained = float(2 * score @ found - found @ gram @ found) if free.any() else 0.0
     found[heard] /= size[heard]
     return found, explained
+
+
+def within_bounds(
+    gram: Gram, hypothesis: Hypothesis
+) -> tuple[Float[np.ndarray, " columns"], float]:
+    """Amplitudes of a hypothesis within their bounds, and the squared error that they explain.
+
+    It explains nothing if all of them are at a bound, such as a negative drag.
+    """
+    at = places_among(hypothesis.columns, gram.kept)
+    limits, inner = (hypothesis.lower, hypothesis.upper), gram.gram[np.ix_(at, at)]
+    return bounded_amplitudes(inner, gram.score[at], gram.size[at], limits)

@@ -3,7 +3,8 @@
 A model has one value for all recordings. If a current offset, the friction of a cold gear or the
 gain of a drive is another one in each of them, what is left cannot be predicted from the motion of
 other recordings, like noise. So values of each recording, and of its first part, are estimated in
-the linear system, and what they explain is compared with what they explain of noise.
+the linear system, and what they explain is compared with what they explain of noise, and of
+functions of the motion: during a short slow motion a missing effect resembles a change.
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,12 +16,14 @@ from jaxtyping import Bool, Float
 
 from ..estimate.result import joint_columns
 from .diagnosis import Diagnosis, over_recordings
+from .random_torques import random_function
 from .relevance import allowed
 from .score import spanned
 from .text import joined
 
 # Smallest share of a joint's squared residual that a change must explain. It must be larger than
-# for each of so many draws of noise, which is a p-value of half a per cent.
+# for each of so many draws of noise, which is a p-value of half a per cent, and of functions of the
+# motion.
 _SHARE, _DRAWS = 0.2, 200
 # Number of parts of a recording, at whose limits a value may change.
 _PARTS = 12
@@ -126,7 +129,9 @@ def changes(
 
 
 def change_of(diagnosis: Diagnosis, joint: int) -> Variation | None:
-    """The change that explains most of a joint's residual, if it explains more than of noise.
+    """The change that explains most of a joint's residual.
+
+    None if it explains as much of noise, or of random functions of the motion.
 
     **Arguments:**
 
@@ -136,18 +141,28 @@ def change_of(diagnosis: Diagnosis, joint: int) -> Variation | None:
     count = len(rows.residual)
     if count <= 2 * rows.basis.shape[1]:
         return None
-    rng, shape = np.random.default_rng(0), diagnosis.data.mask.shape
-    draws = diagnosis.noise[joint].simulate((_DRAWS, *shape), rng)
-    draws = draws[:, diagnosis.data.there[..., joint]]
-    series = rows.without_base(np.column_stack([rows.residual, draws.T]))
+    draws = random_draws(diagnosis, joint)
+    series = rows.without_base(np.column_stack([rows.residual, draws]))
     series /= np.maximum(np.linalg.norm(series, axis=0), 1e-300)
-    found, most = [], np.zeros(_DRAWS)
+    found, most = [], np.zeros(2 * _DRAWS)
     for value in _values(diagnosis, joint):
         for part, shares in _explained(rows, value, series):
             found.append(Variation(value, part, float(shares[0])))
             most = np.maximum(most, shares[1:])
     best = max(found, key=lambda c: c.share)
     return best if best.share > max(_SHARE, float(most.max())) else None
+
+
+def random_draws(diagnosis: Diagnosis, joint: int) -> Float[np.ndarray, "rows draws"]:
+    """Noise of a joint (from 0), and random functions of its motion, at its compared rows."""
+    rng, there = np.random.default_rng(0), diagnosis.data.there[..., joint]
+    data = diagnosis.data
+    noise = diagnosis.noise[joint].simulate((_DRAWS, *data.mask.shape), rng)
+    if data.level is not None:
+        noise *= data.level[:, joint, None]
+    q, v = (np.asarray(x)[..., joint][there] for x in (diagnosis.motion.q, diagnosis.motion.v))
+    functions = [random_function(q, v, rng, odd=bool(k % 2)) for k in range(_DRAWS)]
+    return np.column_stack([*noise[:, there], *functions])
 
 
 def _explained(
@@ -182,7 +197,7 @@ def _values(diagnosis: Diagnosis, joint: int) -> Iterable[JointValue]:
         if own and p.declaration.linear and p.size == 1:
             slope = diagnosis.data.base[:, :, joint, place][there]
             estimate = float(p.where(loop))
-            yield JointValue(p.name, p.declaration.unit, estimate, place, slope)
+            yield JointValue(p.name, loop.units(p)[0], estimate, place, slope)
         place += p.size
     torque = np.asarray(diagnosis.motion.tau)[..., joint][there]
     name = f"the ratio of measured and modelled torque of joint {joint + 1}"

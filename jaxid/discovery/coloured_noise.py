@@ -16,7 +16,9 @@ from .changes import change_of
 from .comparison import Comparison
 from .dependence import ComparedRows, Dependence, among, on_others
 from .diagnosis import Diagnosis, over_recordings
+from .episodes import episode_of
 from .floor import Floor
+from .random_torques import random_function, random_resonance
 from .regressions import AT_ONCE, WITH_MEMORY, AbstractRegression
 from .score import spanned
 from .verdict import over_measured, over_rich
@@ -24,9 +26,8 @@ from .verdict import over_measured, over_rich
 # A residual below the first number of deviations does not depend on the motion. At least half of
 # the functions of the motion that are tried must be above the second one.
 _NONE, _SEEN = 3.0, 6.0
-# Number of functions of the motion for which this is tried, and standard deviation of their wave
-# numbers, in radians over the standard deviation of position and velocity.
-_TRIED, _WAVES = 8, 1.5
+# Number of functions of the motion for which this is tried.
+_TRIED = 8
 
 
 def floor_with_coloured_noise(
@@ -46,8 +47,6 @@ def floor_with_coloured_noise(
     - `worth`: smallest relevant change, in % of a joint's torque.
     """
     left, measured = chosen.error_percent.to_numpy(), diagnosis.measured
-    if left.shape != diagnosis.floor.shape:
-        return measured
     high = above_floors(chosen, diagnosis, worth)
     if not high.any():
         return measured
@@ -63,6 +62,7 @@ def floor_with_coloured_noise(
         free = 1 - min(float(over_recordings(low)[j] / over_recordings(left)[j]), 1.0) ** 2
         coloured[j] = (
             change_of(diagnosis, j) is None
+            and episode_of(diagnosis, j) is None
             and _independent(rows, unseen, j, noise[j])
             and all(
                 _would_be_seen(rows, diagnosis, j, noise[j], free, rings) for rings in (False, True)
@@ -118,9 +118,9 @@ def _would_be_seen(
     regressions, found = WITH_MEMORY if rings else AT_ONCE, []
     for torque in _torques(rows, diagnosis, joint, rings):
         size = np.sqrt(share * np.sum(rest[:, joint] ** 2))
+        torque = torque * (rest[:, joint] != 0)
         changed = np.sqrt(1 - share) * rest
         changed[:, joint] += size * torque / max(np.linalg.norm(torque), 1e-300)
-        changed[rest == 0] = 0
         with_effect = ComparedRows(rows.motion, tuple(np.split(changed, count)), rows.base)
         seen = among(with_effect, joint, filt, regressions)
         found.append(0.0 if seen is None else seen.deviations)
@@ -132,36 +132,24 @@ def _torques(
 ) -> Iterable[Float[np.ndarray, " rows"]]:
     """What the model cannot absorb of random functions of a joint's motion.
 
-    They are waves over position and velocity, every second one with the sign of the velocity, as
-    friction has it.
+    Every second one has the sign of the velocity, as friction has it.
 
     **Arguments:**
 
     - `rings`: whether they are resonances instead, excited by the acceleration or the friction.
     """
-    from scipy.signal import lfilter
-
     data, rng = diagnosis.data, np.random.default_rng(0)
     joints = data.residual.shape[2]
     motion = np.concatenate(rows.motion)
-    q, v, a, sign = (x / (np.std(x) or 1.0) for x in motion[:, joint].T)
+    q, v, a, sign = motion[:, joint].T
     basis = spanned(data.base[data.mask].reshape(-1, data.base.shape[-1]))
     for number in range(_TRIED):
-        whole = np.zeros((len(q), joints))
-        if rings:
-            whole[:, joint] = lfilter(*_resonance(rng), sign if number % 2 else a)
-        else:
-            waves, phase = rng.normal(size=2) * _WAVES, rng.uniform(0, 2 * np.pi)
-            torque = np.cos(waves[0] * q + waves[1] * v + phase)
-            whole[:, joint] = torque * (sign if number % 2 else 1.0)
+        whole, odd = np.zeros((len(q), joints)), bool(number % 2)
+        whole[:, joint] = (
+            random_resonance(sign if odd else a, rng) if rings else random_function(q, v, rng, odd)
+        )
         left = whole.reshape(-1)
         yield (left - basis @ (basis.T @ left)).reshape(whole.shape)[:, joint]
-
-
-def _resonance(rng: np.random.Generator) -> tuple[list[float], list[float]]:
-    """The filter of a resonance of random frequency, which rings for ten rows or longer."""
-    angle, decay = rng.uniform(0.1, 0.8) * np.pi, np.exp(-1 / rng.uniform(10, 40))
-    return [1.0], [1.0, -2 * decay * np.cos(angle), decay**2]
 
 
 def _raised(

@@ -46,7 +46,8 @@ class ComparedRows(eqx.Module):
 
         **Arguments:**
 
-        - `diagnosis`: of this fit, or of one of the same model with other values.
+        - `diagnosis`: of this fit, or of one of the same model with other values. The residual of
+          windows, whose rows differ from those of the recordings, is that of the diagnosis.
         """
         motion, data = diagnosis.motion, diagnosis.data
         signals = _signals(*(np.asarray(x) for x in (motion.q, motion.v, motion.a)))
@@ -54,7 +55,10 @@ class ComparedRows(eqx.Module):
             tuple(x[there] for x, there in zip(rows, data.mask, strict=True))
             for rows in (signals, data.base)
         )
-        return cls(moved, fit.residuals, base)
+        residual = fit.residuals
+        if len(residual) != len(moved):
+            residual = tuple(x[there] for x, there in zip(data.residual, data.mask, strict=True))
+        return cls(moved, residual, base)
 
     @classmethod
     def of_comparison(cls, held_out: Comparison) -> "ComparedRows":

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -17,12 +16,12 @@ from ..effects.curve import coordinate_unit
 from ..errors import FitError
 from ..estimate import Fit
 from ..noise import ARFilter
-from ..parameters import write_values
 from ..storage.saved import save
+from .bounded import within_bounds
 from .comparison import Comparison
 from .data import Data
 from .floor import Floor
-from .hypotheses import Hypothesis, amplitude_names, amplitudes, on_recordings
+from .hypotheses import Hypothesis, amplitude_names, on_recordings, sized
 from .score import Gram
 from .separate import leftover
 
@@ -66,7 +65,6 @@ class Diagnosis(AbstractShown):
     - `ranking`: the catalogue's entries, each at its best setting, best first.
     - `forms`: the same for each form of an effect (class) separately.
     - `where`: free-form curves over every coordinate, best first.
-    - `pair`: two entries that together explain more than the best curve, if no single one does.
     - `noise`: the noise filter of each output.
     - `floor`: relative error that a model with every effect and curve that matters leaves, %.
     - `measured`: the noise floor from the recordings alone, if they determine it.
@@ -79,7 +77,6 @@ class Diagnosis(AbstractShown):
     ranking: tuple[Verdict, ...]
     forms: tuple[Verdict, ...]
     where: tuple[Verdict, ...]
-    pair: tuple[Verdict, ...]
     noise: tuple[ARFilter, ...]
     data: Data
     gram: Gram
@@ -92,6 +89,11 @@ class Diagnosis(AbstractShown):
     measured: Floor | None = None
     errors: Float[np.ndarray, "ranked joints"] | None = None
     shares: Float[np.ndarray, "drawn recordings samples outputs"] | None = None
+
+    @classmethod
+    def fields_of_format(cls, fields: dict[str, Any], written: int) -> dict[str, Any]:
+        """Drops a field of older file formats."""
+        return fields if written > 4 else {k: x for k, x in fields.items() if k != "pair"}
 
     @property
     def best(self) -> AbstractEffect:
@@ -117,7 +119,7 @@ class Diagnosis(AbstractShown):
         For curves, only the products of the first few are kept, because only these are drawn.
         """
         ranked = sorted({c for v in self.ranking for c in v.hypothesis.columns})
-        told = (*self.ranking, *self.forms, *self.pair, *self.where[:_CURVES])
+        told = (*self.ranking, *self.forms, *self.where[:_CURVES])
         products = sorted({c for v in told for c in v.hypothesis.columns})
         return dataclasses.replace(self, data=self.data.only(ranked), gram=self.gram.only(products))
 
@@ -148,13 +150,14 @@ class Diagnosis(AbstractShown):
         return self.data.residual - leftover(self.data, self.noise, verdict.hypothesis.columns)
 
     def predicted(self, verdict: Verdict) -> AbstractEffect:
-        """An effect with the amplitudes that its signature predicts."""
-        effect, columns = verdict.hypothesis.effect, verdict.hypothesis.columns
-        linear = amplitudes(effect)
-        values, _ = self.gram.amplitude(columns)
-        if not linear:
-            return effect.scaled(float(np.clip(values[0], 0.05, 20.0)))
-        return write_values(effect, linear, jnp.asarray(values))
+        """An effect with the amplitudes that its signature predicts, within their bounds.
+
+        If all of them are at a bound (`verdict.possible` is false), they are those without bounds.
+        """
+        values, explained = within_bounds(self.gram, verdict.hypothesis)
+        if not explained > 0:
+            values, _ = self.gram.amplitude(verdict.hypothesis.columns)
+        return sized(verdict.hypothesis.effect, values)
 
     def amplitude(self, verdict: Verdict) -> tuple[np.ndarray, np.ndarray]:
         """Predicted amplitudes and standard deviations, in the units of the effect's parameters."""

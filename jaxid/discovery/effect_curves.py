@@ -19,6 +19,9 @@ from ..effects.placed import Placed
 from ..errors import ModelError
 from ..estimate import Fit
 from ..recording import Recording, Recordings
+from ..simulation.batch import held_at, held_names
+from ..simulation.dynamics import imposed
+from ..simulation.loads import link_load
 from ..simulation.loop import ClosedLoop
 from .comparison import Comparison, compare
 from .forces import force_and_slopes, left_for_links, misreads
@@ -241,7 +244,10 @@ def _motion(run: Comparison, effect: AbstractEffect) -> tuple[Motion, np.ndarray
     def stacked(rows: Iterable[Any]) -> Any:
         return jnp.asarray(np.stack([padded(x) for x in rows]))
 
-    runs = run.runs
+    runs, names = run.runs, held_names(run.recordings)
+    held = [
+        held_at(r, np.asarray(x.time), names) for r, x in zip(run.recordings, runs, strict=True)
+    ]
     # Nested vmaps, because `Motion` declares the shapes of one instant.
     motion = jax.vmap(jax.vmap(Motion))(
         stacked(x.time for x in runs),
@@ -251,7 +257,16 @@ def _motion(run: Comparison, effect: AbstractEffect) -> tuple[Motion, np.ndarray
         stacked(x.tau if commands else x.delivered for x in runs),
         jnp.zeros((len(runs), longest, 0)),
         stacked(np.full(r.samples, recording_label(r.name)) for r in run.recordings),
+        {name: stacked(x[name] for x in held) for name in names},
     )
+    # Effects on the links, whose torque is a part of the load, have no states of their own.
+    states = tuple(e.initial_state() for e in run.loop.effects)
+
+    def of_loop(at: Motion) -> Motion:
+        load = link_load(run.loop, at, states)
+        return dataclasses.replace(at, load=load, imposed=imposed(run.loop))
+
+    motion = jax.vmap(jax.vmap(of_loop))(motion)
     mask = np.stack([np.arange(longest) < r.samples for r in run.recordings])
     return motion, mask
 

@@ -11,7 +11,6 @@ from jaxtyping import Float
 
 from ..control import OpenLoop
 from ..display.shown import AbstractShown
-from ..effects import AbstractTransmission
 from ..errors import FitError
 from ..excitation import Limits
 from ..recording import Recording
@@ -117,14 +116,13 @@ def next_experiment(
             "its controller"
         )
     chosen = list(effects) if effects is not None else _group(diagnosis)
-    # Signatures of transmissions need simulations, too slow to repeat for each reference.
-    asked, parted = chosen, [isinstance(v.hypothesis.effect, AbstractTransmission) for v in chosen]
-    chosen = [v for v, apart in zip(asked, parted, strict=True) if not apart]
-    if any(parted) and len(chosen) < min(len(asked), 2):
-        first = asked[parted.index(True)]
+    # Too slow to repeat for each reference.
+    asked, simulated = chosen, [v for v in chosen if v.hypothesis.effect.finite]
+    chosen = [v for v in asked if not v.hypothesis.effect.finite]
+    if simulated and len(chosen) < min(len(asked), 2):
         raise FitError(
-            f"the signature of {effect_on(*first.key)} needs simulations, too slow to repeat for "
-            "each reference: give two effects that are not transmissions"
+            f"the signature of {effect_on(*simulated[0].key)} needs simulations, too slow to "
+            "repeat for each reference: give two other effects"
         )
     bounds = Limits.of(diagnosis.fit.recordings) if limits is None else limits
     loop = with_substeps(diagnosis.fit.loop, diagnosis.fit.recordings)

@@ -49,8 +49,10 @@ class Fleet(eqx.Module):
 
         rows = []
         for robot, story in self.stories.items():
-            kind = "validate" if "validate" in story["error_percent"]["after"] else "fit"
-            before, after = (max(story["error_percent"][k][kind]) for k in ("before", "after"))
+            errors = [story["error_percent"][k] for k in ("before", "after")]
+            # A model may diverge along a held-out recording.
+            kind = "validate" if all("validate" in x for x in errors) else "fit"
+            before, after = (max(x[kind]) for x in errors)
             rows.append(
                 {
                     "robot": robot,

@@ -12,7 +12,7 @@ from ..effects import AbstractEffect, Curve, Motion, RotorInertia, Scene, check_
 from ..effects import catalogue as known
 from ..effects.curve import curve_over
 from ..errors import FitError, ModelError
-from ..parameters import Parameter, list_parameters
+from ..parameters import Parameter, list_parameters, write_values
 from ..recording import Recordings
 from ..simulation.inertia import mass_matrices
 from ..simulation.loop import ClosedLoop
@@ -53,9 +53,22 @@ def amplitudes(effect: AbstractEffect) -> tuple[Parameter, ...]:
     return tuple(p for p in free_of(effect) if p.declaration.linear)
 
 
+# A setting that is screened by simulations is changed by a factor between these: its signature is
+# that of one size, and says little of a much smaller or larger one.
+_FACTORS = 0.05, 20.0
+
+
+def sized(effect: AbstractEffect, amplitude: Float[np.ndarray, " columns"]) -> AbstractEffect:
+    """The effect with the amplitudes of its signatures, or scaled if its setting is simulated."""
+    linear = amplitudes(effect)
+    if not linear:
+        return effect.scaled(float(np.clip(amplitude[0], *_FACTORS)))
+    return write_values(effect, linear, amplitude)
+
+
 def amplitude_names(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[str, str]]:
     """Name and unit of each amplitude; none if the effect is screened by simulations."""
-    return [(name, loop.unit(p)) for p in amplitudes(effect) for name in p.names]
+    return [x for p in amplitudes(effect) for x in zip(p.names, loop.units(p), strict=True)]
 
 
 def free_of(effect: AbstractEffect) -> tuple[Parameter, ...]:

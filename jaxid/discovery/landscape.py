@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, AbstractTransmission, Curve
-from ..parameters import write_values
 from .bounded import bounded_amplitudes
 from .data import Data
 from .diagnosis import Diagnosis
-from .hypotheses import Hypothesis, amplitudes
+from .hypotheses import Hypothesis, sized
 from .predict import Prediction, Predictor
 from .ranking import Screened
 from .score import Gram, Whitened, by_width, explained_by, spanned, strong_directions
@@ -129,7 +128,7 @@ def _entry(
     amplitude, explained = bounded_amplitudes(gram, score, size, limits)
     if not explained > 0.0:
         return None
-    effect = _sized(hypothesis.effect, amplitude)
+    effect = sized(hypothesis.effect, amplitude)
     return Entry(hypothesis, float(explained - price), effect)
 
 
@@ -164,10 +163,3 @@ def crowded(effects: Sequence[AbstractEffect], own: Sequence[AbstractEffect]) ->
     """
     counts = Counter(form(e)[:2] for e in (*own, *effects))
     return any(counts[form(e)[:2]] > 1 + e.several for e in effects)
-
-
-def _sized(effect: AbstractEffect, amplitude: Float[np.ndarray, " columns"]) -> AbstractEffect:
-    linear = amplitudes(effect)
-    if not linear:
-        return effect.scaled(float(np.clip(amplitude[0], 0.05, 20.0)))
-    return write_values(effect, linear, amplitude)

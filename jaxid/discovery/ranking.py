@@ -13,7 +13,7 @@ from ..effects import Curve, Scene
 from ..errors import FitError
 from ..estimate import Fit
 from ..noise import ARFilter
-from .bounded import bounded_amplitudes
+from .bounded import within_bounds
 from .comparison import Comparison
 from .data import Data
 from .diagnosis import Diagnosis, Verdict, share_left
@@ -165,16 +165,14 @@ def _judged(
     columns = columns_of(blocks, scored.chosen)
     rich = leftover(data, noise, columns)
     absorbed = data.base.shape[-1]
+    # Candidates are counted by setting, because shapes are chosen from the grid and not estimated.
     plain = score(data, data.residual, absorbed, 0, len(blocks))
     with_all = score(data, rich, absorbed + len(columns), len(scored.chosen), len(blocks))
-    best = tuple(sorted(ranking.values(), key=_order, reverse=True))
-    curves = tuple(sorted(where.values(), key=_order, reverse=True))
     return Diagnosis(
         fit=fit,
-        ranking=best,
+        ranking=tuple(sorted(ranking.values(), key=_order, reverse=True)),
         forms=tuple(sorted(forms.values(), key=_order, reverse=True)),
-        where=curves,
-        pair=_pair(gram, hypotheses, best, curves, tests),
+        where=tuple(sorted(where.values(), key=_order, reverse=True)),
         noise=noise,
         data=data,
         gram=gram,
@@ -186,36 +184,6 @@ def _judged(
         unexplained=plain.value - with_all.value,
         measured=floor_of(fit.loop, fit.recordings),
     )
-
-
-def _pair(
-    gram: Gram,
-    hypotheses: list[Hypothesis],
-    ranking: tuple[Verdict, ...],
-    where: tuple[Verdict, ...],
-    tests: float,
-) -> tuple[Verdict, ...]:
-    """Two effects that together explain more than the best curve; empty if there are none.
-
-    Each of the leading entries is combined with every other effect. No pair is searched if one
-    effect explains more than the best curve.
-    """
-    if not where or not ranking or where[0].evidence < ranking[0].evidence:
-        return ()
-    effects = [h for h in hypotheses if not isinstance(h.effect, Curve)]
-    best, most = (), where[0].evidence
-    for first in ranking[:8]:
-        rest = gram.without(first.hypothesis.columns)
-        explained, freedom = rest.explained([h.columns for h in effects])
-        own = [h.name == first.key[0] and h.joint == first.key[1] for h in effects]
-        evidence = np.where(own, -np.inf, explained - freedom * np.log(gram.count))
-        k = int(np.argmax(evidence))
-        if first.evidence + evidence[k] > most:
-            most = first.evidence + evidence[k]
-            value, count = gram.explained([effects[k].columns])
-            second = _verdict(gram, effects[k], float(value[0]), int(count[0]), tests)
-            best = (first, second)
-    return best
 
 
 def _keep_better(found: dict[tuple[Any, ...], Verdict], key: tuple[Any, ...], new: Verdict) -> None:
@@ -241,7 +209,7 @@ def _verdict(
     tests: float,
     wider: float = 1.0,
 ) -> Verdict:
-    within = _within_bounds(gram, hypothesis) if freedom > 0 else 0.0
+    within = within_bounds(gram, hypothesis)[1] if freedom > 0 else 0.0
     # An impossible hypothesis is ranked by what it would explain without bounds.
     explained = (within or explained) / wider
     p = _p_value(hypothesis, explained, freedom, tests)
@@ -255,16 +223,6 @@ def _verdict(
         possible=within > 0.0 and math.isfinite(wider),
         wider=wider,
     )
-
-
-def _within_bounds(gram: Gram, hypothesis: Hypothesis) -> float:
-    """What a hypothesis explains within its bounds; zero if all amplitudes are at a bound.
-
-    A negative drag, for example, is not possible.
-    """
-    at = list(hypothesis.columns)
-    limits, inner = (hypothesis.lower, hypothesis.upper), gram.gram[np.ix_(at, at)]
-    return bounded_amplitudes(inner, gram.score[at], gram.size[at], limits)[1]
 
 
 def _floor(

@@ -305,9 +305,10 @@ class Search(Started):
         if not at.effects:
             return None
         assert at.fit is not None
-        found = []
+        found, size = [], len(at.effects)
+        saved = price(size, self.forms) - price(size - 1, self.forms)
         for gone in at.effects:
-            if needed(at.fit, gone, price(len(at.effects), self.forms)):
+            if needed(at.fit, gone, saved):
                 continue
             less = tuple(e for e in at.effects if e is not gone)
             had = self.had(at, less)

@@ -119,12 +119,21 @@ def _told(
     loop: ClosedLoop, recordings: Recordings
 ) -> dict[tuple[str, ...], tuple[JointTerms, ...]]:
     """The terms by recordings with the same drive settings, at the medians of these."""
-    groups: dict[Any, tuple[list[str], dict[str, np.ndarray]]] = {}
+    groups: dict[Any, list[Recording]] = {}
     for r in recordings:
-        told = {name: np.median(getattr(r, name), axis=0) for name in r.held_names}
-        key = tuple((name, tuple(x)) for name, x in told.items() if name in ("kp", "kd"))
-        groups.setdefault(key, ([], told))[0].append(r.name)
-    return {tuple(names): joint_terms(loop, told) for names, told in groups.values()}
+        own = [(name, np.median(getattr(r, name), axis=0)) for name in r.held_names]
+        key = tuple((name, tuple(x)) for name, x in own if name in ("kp", "kd"))
+        groups.setdefault(key, []).append(r)
+    return {
+        tuple(r.name for r in group): joint_terms(
+            loop,
+            {
+                name: np.median(np.concatenate([getattr(r, name) for r in group]), axis=0)
+                for name in group[0].held_names
+            },
+        )
+        for group in groups.values()
+    }
 
 
 def _errors(loops: dict[str, ClosedLoop], recordings: Recordings) -> "pd.DataFrame":

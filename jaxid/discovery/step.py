@@ -159,6 +159,7 @@ def effect_parameters(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[in
             # Values with names of their own, such as those of a carried body, keep them.
             numbered = [f"{steps[-1]}[{k + 1}]" if p.several else steps[-1] for k in range(p.size)]
             names = p.labels or numbered
-            found += [(place + k, str(name), loop.unit(p)) for k, name in enumerate(names)]
+            units = loop.units(p)
+            found += [(place + k, str(name), units[k]) for k, name in enumerate(names)]
         place += p.size
     return found

@@ -11,6 +11,7 @@ from .changes import changes
 from .coloured_noise import floor_with_coloured_noise
 from .dependence import depends_on_motion
 from .diagnosis import over_recordings
+from .episodes import in_one_episode
 from .held_out import diverges, on_held_out, raised, tested, with_held_out
 from .hypotheses import effect_on
 from .landscape import form
@@ -74,8 +75,10 @@ def told(
             last.fit, last.diagnosis, noise, last.held_out, search.asked.worth
         )
         steps = _without_probabilities(steps) if reason else steps
-    if not interrupted and (change := _changed(search, steps, verdict, reason)):
-        steps, reason = _without_probabilities(steps), change
+    if not interrupted:
+        unlike = _in_one_episode(search, steps[-1]) or _changed(search, steps, verdict, reason)
+        steps = _without_probabilities(steps) if unlike else steps
+        reason = unlike or reason
     notes = (short,) if unfinished and reason != short else ()
     return Discovery(
         verdict="undetermined" if reason else verdict,
@@ -100,6 +103,20 @@ def _notes(search: Search, steps: Sequence[Step]) -> list[str]:
     ]
 
 
+def _sound(step: Step) -> bool:
+    """Whether a step has a fit whose residual can be analysed."""
+    converged = step.fit.status is Status.converged and not step.fit.mistake
+    return converged and step.diagnosis is not None
+
+
+def _in_one_episode(search: Search, last: Step) -> str:
+    """The reason if what the final model leaves is large in one episode; empty if it is not."""
+    if not _sound(last):
+        return ""
+    assert last.diagnosis is not None
+    return in_one_episode(last.diagnosis, search.asked.worth)
+
+
 def _changed(search: Search, steps: Sequence[Step], verdict: Outcome, reason: str) -> str:
     """The reason if a value is not the same throughout the recordings; empty if there is another.
 
@@ -115,11 +132,12 @@ def _changed(search: Search, steps: Sequence[Step], verdict: Outcome, reason: st
     error = over_recordings(last.fit.error_percent.to_numpy())
     found = [("", 0.0)]
     for step in (last, steps[0])[: len(steps)]:
-        sound = step.fit.status is Status.converged and not step.fit.mistake
-        if step.diagnosis is not None and sound:
+        if _sound(step):
+            assert step.diagnosis is not None
             found.append(changes(step.diagnosis, worth, error))
     said, share = max(found, key=lambda x: x[1])
-    if share > _MOST if reason else verdict != "outside_catalogue":
+    is_the_reason = share > _MOST if reason else verdict != "outside_catalogue"
+    if is_the_reason:
         return said
     if said:
         search.note(said)

@@ -133,7 +133,7 @@ def _floor_of_unseen(fit: Fit, measured: Floor | None, unseen: Comparison) -> Fl
 
 
 def explains_little(fit: Fit, noise: Sequence[ARFilter], measured: Floor | None) -> str:
-    """The reason if a third of a joint's torque is unexplained and not noise.
+    """The reason if 30 % of a joint's torque are unexplained and not noise.
 
     **Arguments:**
 
@@ -173,7 +173,7 @@ def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
     percent = over_recordings(fit.error_percent.to_numpy())
     for j, label in enumerate(joint_columns(fit.loop.joints)):
         rate = np.zeros_like(data.residual)
-        rate[..., j] = np.gradient(torque[..., j], step, axis=1) * data.mask
+        rate[..., j] = np.gradient(torque[..., j], step, axis=1) * data.there[..., j]
         own = rate.reshape(-1)
         own = own - basis @ (basis.T @ own)
         late = float(own @ left) / max(float(own @ own), 1e-300)
@@ -309,12 +309,12 @@ def _above_noise(fit: Fit, held_out: Comparison, noise: Sequence[ARFilter], wort
     """The reason if the held-out error is larger than noise and uncertain parameters explain."""
     # Noise may grow with the motion. Its power is that of the noisiest fitted recording, or the
     # estimate from the held-out recording itself if that is larger.
-    fitted = np.max([np.mean(r**2, axis=0) for r in fit.residuals], axis=0)
-    left = np.stack([np.mean(r**2, axis=0) for r in held_out.residuals])
+    fitted = np.max([_mean_square(r) for r in fit.residuals], axis=0)
+    left = np.stack([_mean_square(r) for r in held_out.residuals])
     own = [[_power(f, r[:, j]) for j, f in enumerate(noise)] for r in held_out.residuals]
     power = np.maximum(fitted, np.array(own))
-    chance = np.array(
-        [[_spread(f, len(r)) + 2 / np.sqrt(len(r)) for f in noise] for r in held_out.residuals]
+    chance = np.stack(
+        [[_chance(f, r[:, j]) for j, f in enumerate(noise)] for r in held_out.residuals]
     )
     percent = held_out.error_percent.to_numpy()
 
@@ -345,15 +345,24 @@ def _power(filt: ARFilter, rest: Float[np.ndarray, " samples"]) -> float:
     The level is the median over frequencies. A missing effect hardly changes the median, because it
     is slow and concerns few frequencies.
     """
-    white = filt.innovations(rest, rest != 0)
-    spectrum = np.abs(np.fft.rfft(white)[1:]) ** 2 / len(white)
+    there = rest != 0
+    white = filt.innovations(rest, there)
+    spectrum = np.abs(np.fft.rfft(white)[1:]) ** 2 / max(np.count_nonzero(there), 1)
     return float(np.median(spectrum) / np.log(2) * filt.gain)
 
 
-def _spread(filt: ARFilter, samples: int) -> float:
-    """Relative standard deviation of the mean square of noise from a filter."""
-    power = filt.spectrum(max(samples, 64))
-    return float(np.sqrt(2 / samples * np.mean(power**2)) / np.mean(power))
+def _mean_square(rest: Float[np.ndarray, "rows joints"]) -> Float[np.ndarray, " joints"]:
+    """Mean square at the rows that are compared; the others are zero."""
+    return np.sum(rest**2, axis=0) / np.maximum(np.count_nonzero(rest, axis=0), 1)
+
+
+def _chance(filt: ARFilter, rest: Float[np.ndarray, " rows"]) -> float:
+    """Relative standard deviation of the mean square of noise over that of `_power`."""
+    rows = max(int(np.count_nonzero(rest)), 1)
+    spectrum = filt.spectrum(max(rows, 64))
+    spread = np.sqrt(2 / rows * np.mean(spectrum**2)) / np.mean(spectrum)
+    # The median of half as many exponential variables, over its expectation.
+    return float(spread + 1 / (np.log(2) * np.sqrt(rows / 2)))
 
 
 def _unsure(fit: Fit, held_out: Comparison) -> Float[np.ndarray, "recordings joints"]:
@@ -366,5 +375,5 @@ def _unsure(fit: Fit, held_out: Comparison) -> Float[np.ndarray, "recordings joi
     loose = ~np.isfinite(np.diag(fit.covariance))
     shown = np.einsum("rsoa,ab,rsob->rso", slopes, variance, slopes)
     shown = shown + np.where(np.any(slopes[..., loose] != 0, axis=-1), np.inf, 0.0)
-    kept = system.mask[..., None]
-    return np.sum(np.where(kept, shown, 0.0), axis=1) / np.sum(kept, axis=1)
+    kept = system.mask[..., None] & (system.residual != 0)
+    return np.sum(np.where(kept, shown, 0.0), axis=1) / np.maximum(np.sum(kept, axis=1), 1)

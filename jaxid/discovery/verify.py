@@ -257,8 +257,9 @@ def _starts_apart(
     """Whether residuals are much larger in the first rows, which filters ignore, than later."""
     for rest in residuals:
         for output, filt in zip(rest.T, noise, strict=True):
-            first, later = output[: filt.order] ** 2, output[filt.order :] ** 2
-            if len(first) and first.mean() > _APART**2 * later.mean():
+            # Rows that are not compared are zero.
+            first, later = (x[x != 0] ** 2 for x in (output[: filt.order], output[filt.order :]))
+            if len(first) and len(later) and first.mean() > _APART**2 * later.mean():
                 return True
     return False
 
@@ -268,7 +269,7 @@ def needed(fit: Fit, effect: AbstractEffect, price: float) -> bool:
 
     **Arguments:**
 
-    - `price`: price of the choice of effects in the score.
+    - `price`: decrease of the price of the choice without the effect.
     """
     place = next(k for k, e in enumerate(fit.loop.effects) if e is effect)
     places = values_of(fit.loop, place)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..chain import BODY, Chain, moved_body
+from ..chain import BODY, BODY_UNITS, Chain, moved_body
 from ..parameters import KNOWN, Scalar, Vector, as_float64, parameter
 from ._base import NOBODY, AbstractEffect, Motion, recording_label
 from ._scene import Scene
@@ -111,7 +111,7 @@ class CarriedBody(AbstractEffect):
 
     chain: Chain = eqx.field(metadata=KNOWN)
     mass: Scalar = parameter(0.0, symbol="payload", unit="kg", lower=0.0, scale=0.5)
-    rest: Vector = parameter((0.0,) * 9, symbol="payload_rest", unit="SI", scale=0.05)
+    rest: Vector = parameter((0.0,) * 9, symbol="payload_rest", unit="", scale=0.05)
     recordings: tuple[str, ...] = eqx.field(static=True, default=())
     shown: tuple[int, ...] = eqx.field(static=True, default=tuple(range(9)))
     inertial = True
@@ -139,6 +139,11 @@ class CarriedBody(AbstractEffect):
         """Names of the other parameters, with their recordings."""
         where = f"({','.join(self.recordings)})" if self.recordings else ""
         return tuple(f"payload_{BODY[k]}{where}" for k in self.shown)
+
+    @property
+    def rest_units(self) -> tuple[str, ...]:
+        """Units of the other parameters."""
+        return tuple(BODY_UNITS[k] for k in self.shown)
 
     def about_tip(self) -> Float[Array, "10"]:
         """Its parameters in the order of `BODY` about the tip, SI units."""

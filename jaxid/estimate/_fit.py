@@ -156,8 +156,7 @@ def _begun(loop: ClosedLoop, recordings: Recordings) -> list[str]:
 
 def _uncompared(found: Fit) -> list[str]:
     """Notes on joints that have no compared sample in a recording."""
-    windows = len(found.residuals) != len(found.recordings)
-    if windows or not found.loop.controller.imposes:
+    if not found.loop.controller.imposes:
         return []
     return [
         f"joint {j + 1} rests in almost all of {r.name}, so its torque is not compared there"

@@ -78,5 +78,6 @@ def _at_bounds(loop: ClosedLoop) -> list[str]:
         value = np.ravel(np.asarray(p.where(loop)))
         for bound, word in ((p.declaration.lower, "lower"), (p.declaration.upper, "upper")):
             if np.isfinite(bound) and np.any(np.abs(value - bound) < 1e-9 * p.declaration.scale):
-                notes.append(f"{p.name} is at its {word} bound, {bound:g} {loop.unit(p)}")
+                unit = " or ".join(dict.fromkeys(loop.units(p)))
+                notes.append(f"{p.name} is at its {word} bound, {bound:g} {unit}")
     return notes

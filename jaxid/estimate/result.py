@@ -122,7 +122,7 @@ class Fit(AbstractShown):
     @property
     def units(self) -> tuple[str, ...]:
         """One unit for each value."""
-        return tuple(self.loop.unit(p) for p in self.loop.free_parameters for _ in p.names)
+        return tuple(unit for p in self.loop.free_parameters for unit in self.loop.units(p))
 
     @property
     def innovations(self) -> tuple[Float[np.ndarray, "_samples joints"], ...]:

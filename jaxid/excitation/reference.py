@@ -65,7 +65,11 @@ class Excitation(AbstractShown):
         """Predicted deviations."""
         import pandas as pd
 
-        known = {n: self.loop.unit(p) for p in self.loop.parameters for n in p.names}
+        known = {
+            name: unit
+            for p in self.loop.parameters
+            for name, unit in zip(p.names, self.loop.units(p), strict=True)
+        }
         units = [known[name] for name in self.names]
         return pd.DataFrame(
             {"std": self.std, "unit": units}, index=pd.Index(self.names, name="parameter")

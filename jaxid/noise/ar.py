@@ -143,7 +143,8 @@ class ARFilter(eqx.Module):
         filt = self.stabilised()
         slowest = max(np.abs(np.roots(filt.polynomial)), default=0.0)
         # The transient from the start at zero has decayed to 1e-4.
-        settle = min(50_000, int(np.ceil(np.log(1e-4) / np.log(min(slowest, 0.9999))))) + 1
+        pole = np.clip(slowest, 1e-12, 0.9999)
+        settle = min(50_000, int(np.ceil(np.log(1e-4) / np.log(pole)))) + 1
         lead = settle if filt.order else 0
         white = rng.standard_normal((*shape[:-1], shape[-1] + lead))
         noise = scipy.signal.lfilter([np.sqrt(filt.variance)], filt.polynomial, white, axis=-1)

@@ -28,7 +28,7 @@ class Sliders:
         self._effect, self._free = effect, free_of(effect)
         self._moved, self._quiet = moved, False
         values = np.asarray(read_values(effect, self._free)) if self._free else np.zeros(0)
-        labels = [(name, loop.unit(p)) for p in self._free for name in p.names]
+        labels = [x for p in self._free for x in zip(p.names, loop.units(p), strict=True)]
         self.widgets = [
             _slider(name, unit, float(value), *ranges[name])
             for (name, unit), value in zip(labels, values, strict=True)

@@ -113,11 +113,11 @@ class ClosedLoop(eqx.Module):
         """One name for each value that a fit estimates."""
         return tuple(name for p in self.free_parameters for name in p.names)
 
-    def unit(self, parameter: Parameter) -> str:
-        """A parameter's unit; with m and N for a prismatic joint."""
-        unit, joint = parameter.declaration.unit, parameter.joint
+    def units(self, parameter: Parameter) -> tuple[str, ...]:
+        """One unit for each value of a parameter; with m and N for a prismatic joint."""
+        joint = parameter.joint
         slides = joint is not None and self.arm.prismatic()[joint - 1]
-        return sliding_unit(unit) if slides else unit
+        return tuple(map(sliding_unit, parameter.units)) if slides else parameter.units
 
     @property
     def theta(self) -> Vector:
@@ -277,4 +277,5 @@ def _row(loop: ClosedLoop, p: Parameter) -> tuple[str, ...]:
     bounds = [f"≥ {low:g}" if low > -math.inf else "", f"≤ {high:g}" if high < math.inf else ""]
     value = "several" if p.several else f"{float(p.where(loop)):.4g}"
     free = any(p.place == other.place for other in loop.free_parameters)
-    return p.name, value, loop.unit(p), " ".join(filter(None, bounds)), "" if free else "held"
+    unit = ", ".join(dict.fromkeys(loop.units(p)))
+    return p.name, value, unit, " ".join(filter(None, bounds)), "" if free else "held"

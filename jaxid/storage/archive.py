@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 # 2: a loop stores held and freed parameters by place instead of by name.
 # 3: the smoothing of a sign is a speed instead of its inverse.
 # 4: signatures are stored by output.
-FORMAT = 4
+# 5: a diagnosis has no pair of effects.
+FORMAT = 5
 
 # Limit of the manifest, which contains all but arrays; a long story has about one megabyte.
 _LARGEST_MANIFEST = 256 * 2**20
