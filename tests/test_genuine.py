@@ -10,7 +10,16 @@ from stories import recordings_of, scene_of, search_of
 
 import jaxid
 from jaxid.discovery.hypotheses import survey
-from jaxid.effects import EndStop, Hysteresis, LuGre, Motion, Stribeck, ThermalDrift, Viscous
+from jaxid.effects import (
+    EndStop,
+    Hysteresis,
+    LuGre,
+    Motion,
+    Stribeck,
+    ThermalDrift,
+    TorqueRipple,
+    Viscous,
+)
 
 
 @pytest.mark.parametrize(
@@ -43,6 +52,13 @@ def test_a_stop_leaves_a_part_of_the_travel_free(side, share, expected):
     angle = high - share * travel if side > 0 else low + share * travel
     stop = EndStop(joint=1, stiffness=40.0, angle=angle, side=side)
     assert stop.genuine(scene, []) is expected
+
+
+@pytest.mark.parametrize(("waves", "expected"), [(0.7, False), (1.4, True), (9.0, True)])
+def test_a_ripple_has_more_than_a_wave(waves, expected):
+    scene = scene_of(3.0)
+    ripple = TorqueRipple(joint=1, harmonic=2 * np.pi * waves / scene.travel(1))
+    assert ripple.genuine(scene, []) is expected
 
 
 @pytest.mark.parametrize("kind", [Hysteresis, LuGre])

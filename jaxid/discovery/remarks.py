@@ -180,7 +180,8 @@ def _delayed(fit: Fit, given: ClosedLoop) -> list[str]:
         if abs(value - before) > _APART * std:
             way = "later" if value > 0 else "earlier"
             samples = value / fit.recordings.common_period()
-            if _HELD[0] < samples < _HELD[1]:
+            held = _APART * std / fit.recordings.common_period()
+            if abs(samples - 0.5) < max(held, _ABOUT):
                 cause = "as if it is held from one sample to the next"
             elif 0 < samples <= LATE:
                 cause = (
@@ -221,6 +222,8 @@ def _instead(fit: Fit, given: ClosedLoop, offsets: Mapping[str, AbstractEffect])
 # Range of delays, in samples, of a law that is computed at the rate of the recording and held, and
 # the smallest one of a faster law.
 _HELD, _FASTER = (0.25, 0.8), 0.05
+# Largest difference from half a sample, in samples, of a delay that holding alone causes.
+_ABOUT = 0.1
 
 
 def looks_sampled(fit: Fit) -> list[str]:

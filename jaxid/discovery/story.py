@@ -143,9 +143,14 @@ class Discovery(AbstractShown):
         assert isinstance(curve, Curve)
         on = "time" if curve.coordinate == "t" else f"the {curve.spoken_coordinate}"
         how = " and on the direction of motion" if curve.signed else ""
+        cause = (
+            " A torque constant that varies with the current, or a drive that limits its torque, "
+            "has this effect."
+        )
+        by_torque = curve.coordinate == "tau" and curve.of == hypothesis.joint
         return capitalised(
             f"{lacked}none of the examined effects explains how the residual torque of joint "
-            f"{hypothesis.joint} depends on {on}{how}."
+            f"{hypothesis.joint} depends on {on}{how}.{cause * by_torque}"
         )
 
     def _sure(self) -> str:

@@ -46,7 +46,8 @@ def told(
     """The result of a search, with errors on held-out recordings."""
     models = search.visited.weighed(search.at)
     steps = tested(search, _steps(search, models))
-    if not interrupted:
+    # If a curve explains the residual, it is no noise.
+    if not interrupted and verdict != "outside_catalogue":
         steps = [*steps[:-1], _with_coloured_noise(search, steps[-1])]
     models = with_held_out(search, models, steps)
     short = _stopped_short(search.asked.most)

@@ -15,6 +15,9 @@ from ._scene import Scene
 _LIKELY = 0.1
 # Largest share of the travel over which a stop acts; over more of it, it is a spring.
 _SPRING = 0.75
+# With fewer waves over the travel, ripple is not distinct from a spring. Those of an estimated
+# ripple may be fewer than those that are screened.
+_SCREENED, _FEWEST = 1.5, 1.25
 
 
 class TorqueRipple(AbstractEffect):
@@ -29,15 +32,16 @@ class TorqueRipple(AbstractEffect):
 
     @classmethod
     def screened(cls, scene: Scene) -> Iterable["TorqueRipple"]:
-        """Harmonics up to thirty waves over the travel, a third of a wave apart.
-
-        With less than one and a half waves over the travel, ripple is not distinct from a spring.
-        """
+        """Harmonics up to thirty waves over the travel, a third of a wave apart."""
         return [
             cls(joint=j, harmonic=2 * np.pi * waves / scene.travel(j))
             for j in scene.joints
-            for waves in np.arange(1.5, 30.0, 1 / 3)
+            for waves in np.arange(_SCREENED, 30.0, 1 / 3)
         ]
+
+    def genuine(self, scene: Scene, beside: Sequence[AbstractEffect]) -> bool:
+        """Whether there are enough waves over the travel. A part of a wave is any smooth curve."""
+        return float(self.harmonic) * scene.travel(self.joint) > _FEWEST * 2 * np.pi
 
     def torque(self, motion: Motion) -> Float[Array, " joints"]:
         """The wave on the joint, `(joints,)`."""
