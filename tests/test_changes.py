@@ -9,7 +9,7 @@ from loops import sines
 
 import jaxid
 from jaxid.control import Tracking
-from jaxid.discovery.changes import change_of, changes
+from jaxid.discovery.changes import change_of, changed_values
 from jaxid.effects import Coulomb, Stribeck, TorqueOffset, Viscous
 from jaxid.noise import ARFilter
 
@@ -57,7 +57,7 @@ def diagnosed(*runs):
 )
 def test_a_value_that_differs_between_recordings_is_named(first, second, name, values):
     diagnosis = diagnosed(recorded(1, **first), recorded(2, **second))
-    said, share = changes(diagnosis, WORTH)
+    said, share = changed_values(diagnosis, WORTH)
     assert share > 0.8
     assert f"{name} differs between the recordings: " in said
     assert "find what changed, or fit the recordings separately" in said
@@ -70,7 +70,7 @@ def test_a_value_that_differs_between_recordings_is_named(first, second, name, v
 
 def test_friction_that_changes_during_recordings_is_named():
     diagnosis = diagnosed(recorded(1, brake=8.0), recorded(2, brake=5.0))
-    said, share = changes(diagnosis, WORTH)
+    said, share = changed_values(diagnosis, WORTH)
     assert share > 0.7
     assert said.startswith("Fc1 changes during the recordings: +")
     change = change_of(diagnosis, 0)
@@ -85,16 +85,18 @@ def test_a_model_with_other_errors_is_compared_with_a_change():
     change = change_of(diagnosis, 0)
     assert change is not None
     left = error * np.sqrt(1 - change.share)
-    assert changes(diagnosis, WORTH, 1.5 * left)[1] == pytest.approx(1 - 1 / 1.5**2, abs=0.01)
+    assert changed_values(diagnosis, WORTH, 1.5 * left)[1] == pytest.approx(
+        1 - 1 / 1.5**2, abs=0.01
+    )
     # Effects that explain as much.
-    assert changes(diagnosis, WORTH, 1.05 * left) == ("", 0.0)
+    assert changed_values(diagnosis, WORTH, 1.05 * left) == ("", 0.0)
 
 
 def test_slow_noise_is_no_change():
     """The tests of five pairs of recordings; a p-value is below 0.005 if a change is found."""
     for seed in range(5):
         pair = diagnosed(recorded(10 + seed, slow=True), recorded(20 + seed, slow=True))
-        assert changes(pair, WORTH) == ("", 0.0)
+        assert changed_values(pair, WORTH) == ("", 0.0)
 
 
 def test_a_missing_effect_in_a_short_slow_motion_is_no_change():

@@ -10,13 +10,15 @@ import scipy
 from stories import recordings_of
 
 import jaxid
-from jaxid.control import Sampled
+from jaxid.control import Sampled, Tracking
 from jaxid.discovery import verdict
 from jaxid.discovery.floor import Floor
 from jaxid.discovery.models import Model
 from jaxid.discovery.remarks import looks_sampled
 from jaxid.discovery.undecided import undecided
 from jaxid.discovery.verdict import (
+    _chance,
+    _mean_square,
     _power,
     _spread,
     indefinite,
@@ -217,6 +219,33 @@ def test_torque_and_motion_apart_in_time_are_named_with_the_delay(found):
     assert "the residual of joint 2" in said
     delay = 1e-3 * float(re.search(r"recorded ([\d.]+) ms before it acts", said)[1])
     assert delay == pytest.approx(late, rel=0.1)
+
+
+def test_the_time_shift_of_one_torque_is_found_beside_the_delay_of_all(offset_case):
+    """Torque of joint 2 logged 8 ms late, under an unknown law, whose delay is estimated too."""
+    made = []
+    for r in recordings_of(offset_case)[0]:
+        tau = np.array(r.tau)
+        tau[:, 1] = np.interp(r.time - 0.008, r.time, tau[:, 1])
+        made.append(jaxid.Recording.from_arrays(r.time, r.q, tau, name=r.name))
+    loop = jaxid.scara(Tracking()).add(TorqueOffset(joint=2))
+    fit = jaxid.fit(loop, made, jaxid.OEM(progress=False))
+    diagnosis = jaxid.diagnose(fit, catalogue=[Spring], progress=False)
+    said = refuted(fit, diagnosis.noise, diagnosis, None, WORTH)
+    # With two joints, one late torque is the same as a common delay and the other torque early.
+    assert re.search(r"joint 1 .* before it acts|joint 2 .* after it acts", said)
+    delay = re.search(r"relative to the other joints, its torque is recorded ([\d.]+) ms", said)[1]
+    assert float(delay) == pytest.approx(8.0, rel=0.2)
+
+
+def test_rows_that_are_not_compared_change_no_mean_square():
+    rng = np.random.default_rng(3)
+    rows = NOISE.simulate((4000,), rng)
+    at_rest = np.where(np.arange(4000) % 2000 < 1500, 0.0, rows)
+    moving = at_rest[at_rest != 0]
+    assert _mean_square(at_rest[:, None]) == pytest.approx(np.mean(moving**2))
+    assert _power(NOISE, at_rest) == pytest.approx(NOISE.gain * NOISE.variance, rel=0.25)
+    assert _chance(NOISE, at_rest) == pytest.approx(2 * _chance(NOISE, rows), rel=0.01)
 
 
 def test_a_drive_that_is_late_by_half_a_sample_looks_sampled(found):

@@ -147,8 +147,7 @@ def _late(given: ClosedLoop, effects: Sequence[AbstractEffect], period: float) -
     late: dict[int, float] = {}
     for effect in effects:
         if isinstance(effect, DELAYS):
-            delay = effect.delay if isinstance(effect, TimeDelay) else effect.time_constant
-            late[effect.joint] = late.get(effect.joint, 0.0) + float(delay)
+            late[effect.joint] = late.get(effect.joint, 0.0) + float(effect.late)
     times = tuple(late.values())
     if not simulated_continuously(given) or len(times) < given.joints:
         return ()

@@ -1,8 +1,8 @@
 """Values of a model that differ between recordings, or that change during them.
 
 A model has one value for all recordings. If a current offset, the friction of a cold gear or the
-gain of a drive is another one in each of them, what is left cannot be predicted from the motion of
-other recordings, like noise. So values of each recording, and of its first part, are estimated in
+gain of a drive differs between them, what is left cannot be predicted from the motion of other
+recordings, like noise. So values of each recording, and of its first part, are estimated in
 the linear system, and what they explain is compared with what they explain of noise, and of
 functions of the motion: during a short slow motion a missing effect resembles a change.
 """
@@ -82,7 +82,7 @@ class JointRows(eqx.Module):
 class Variation(eqx.Module):
     """A value that is not the same throughout the recordings.
 
-    - `part`: number of the part of each recording in which it is another one; zero for the whole.
+    - `part`: number of the part of each recording in which the value differs; zero for the whole.
     - `share`: part of the joint's squared residual that it explains.
     """
 
@@ -91,7 +91,7 @@ class Variation(eqx.Module):
     share: float
 
 
-def changes(
+def changed_values(
     diagnosis: Diagnosis, worth: float, chosen: Float[np.ndarray, " joints"] | None = None
 ) -> tuple[str, float]:
     """What is not the same throughout the recordings, and its share of a joint's squared error.

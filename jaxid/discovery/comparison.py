@@ -119,8 +119,12 @@ class Comparison(AbstractShown):
     @property
     def residuals(self) -> tuple[Float[np.ndarray, "_samples joints"], ...]:
         """Measured minus simulated signal as compared, one `(samples, joints)` per recording."""
-        found = [self.judged(k) for k in range(len(self.recordings))]
-        return tuple(measured - simulated for _, measured, simulated in found)
+        if self.signal == "position":
+            pairs = zip(self.recordings, self.runs, strict=True)
+            return tuple(record.q - np.asarray(run.q) for record, run in pairs)
+        torques = [np.asarray(x.tau) for x in self.runs]
+        both = compared_torques(self.loop, self.recordings, torques)
+        return tuple(measured - simulated for measured, simulated in zip(*both, strict=True))
 
     def autocorrelation(
         self, recording: int | str = 0, lags: int = 38

@@ -81,8 +81,8 @@ class Episode(eqx.Module):
 def in_one_episode(diagnosis: Diagnosis, worth: float) -> str:
     """The reason if the residual of joints is large in one episode only; empty if it is not.
 
-    A push or a contact in one recording cannot be predicted from others, so it would be taken for
-    noise, and it spoils the estimated values.
+    A push or a contact in one recording cannot be predicted from others, like noise, and the
+    estimated values are wrong at all times.
 
     **Arguments:**
 

@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import AbstractEffect, Curve, Motion, RotorInertia, Scene, check_declared
+from ..effects import (
+    AbstractEffect,
+    Curve,
+    Motion,
+    PeriodicDisturbance,
+    RotorInertia,
+    Scene,
+    check_declared,
+)
 from ..effects import catalogue as known
 from ..effects.curve import curve_over
 from ..errors import FitError, ModelError
@@ -212,6 +220,4 @@ def candidates(
     for one in {type(e): e for e in made if type(e) not in known}.values():
         check_declared(one, len(scene.slides))
     picked = max(1, sum(len(row) for row in scene.tones))
-    return [
-        (e, trials / picked if e.effect_name() == "periodic_disturbance" else 1.0) for e in made
-    ]
+    return [(e, trials / picked if isinstance(e, PeriodicDisturbance) else 1.0) for e in made]

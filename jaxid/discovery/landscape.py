@@ -154,12 +154,12 @@ def shares_a_joint(effects: Sequence[AbstractEffect]) -> bool:
 def crowded(effects: Sequence[AbstractEffect], own: Sequence[AbstractEffect]) -> bool:
     """Whether a joint would have more of a kind of effect than it can have.
 
-    A joint may have two effects of some kinds, such as end stops at both ends of the travel or two
-    harmonics of a ripple, and one of the others. More of them only approximate another effect.
+    A joint may have more than one effect of some kinds, such as end stops at both ends of the
+    travel or harmonics of a ripple. More of them only approximate another effect.
 
     **Arguments:**
 
     - `effects`: additional effects. `own`: those that the model has.
     """
     counts = Counter(form(e)[:2] for e in (*own, *effects))
-    return any(counts[form(e)[:2]] > 1 + e.several for e in effects)
+    return any(counts[form(e)[:2]] > e.several for e in effects)

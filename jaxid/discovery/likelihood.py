@@ -11,10 +11,7 @@ from ..estimate import Fit
 from ..estimate.prior import prior_of
 from ..noise import ARFilter
 from .data import Data
-from .separate import filter_of
-
-# Largest order of a model's noise filters.
-_HIGHEST = 30
+from .separate import HIGHEST, filter_of
 
 
 class Score(eqx.Module):
@@ -74,7 +71,7 @@ def noise_filters(
 ) -> tuple[ARFilter, ...]:
     """The noise filters of residuals, one per joint, as in a score."""
     joints = range(residuals[0].shape[1])
-    return tuple(filter_of([r[:, j] for r in residuals], _HIGHEST) for j in joints)
+    return tuple(filter_of([r[:, j] for r in residuals], HIGHEST) for j in joints)
 
 
 def _scored(series: Sequence[Sequence[np.ndarray]], freedom: int, paid: float) -> Score:
@@ -83,7 +80,7 @@ def _scored(series: Sequence[Sequence[np.ndarray]], freedom: int, paid: float) -
     value, noise = 0.0, []
     for rows in series:
         # The mean is not subtracted: the model must explain it.
-        found = filter_of(rows, _HIGHEST)
+        found = filter_of(rows, HIGHEST)
         size = np.array([np.count_nonzero(s) for s in rows])
         value += sum(found.starts(s != 0) for s in rows)
         # Each recording has its own noise level if that lowers the score.

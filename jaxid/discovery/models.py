@@ -38,7 +38,8 @@ class Model(eqx.Module):
     - `fit`: its full refit; None if it was only predicted.
     - `noise`: noise filters of its residual, one per output.
     - `left`: relative error on the fitted recordings by joint, %.
-    - `beyond`: number of its effects, and its curve, that were predicted from a fitted model.
+    - `beyond`: number of effects, plus one for a curve, that the prediction added to a fitted
+      model.
     - `weight`: its posterior weight among all examined models.
     - `held_out`: its comparison with held-out recordings, if there is one.
     """

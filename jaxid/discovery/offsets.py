@@ -65,13 +65,13 @@ def instead_of_offsets(predictor: Predictor, std: Float[np.ndarray, " values"]) 
         if there.possible:
             effect = there.effects[0]
             then = _score(without, there.rest, there.freedom, there.taken)
-            loop = without.system.loop.add(effect)
+            exchanged = without.system.loop.add(effect)
             coulomb, rest, taken = _coulomb_alone(without, there)
             alone = _score(without, rest, there.freedom - 1, taken)
             if alone.value < then.value:
                 effect, then = AsymmetricFriction(joint=joint, coulomb=coulomb, **sign), alone
-                loop = _without_viscous(without.system.loop.add(effect))
-            found.append(Instead(loop, p.name, effect, then.noise, then.value - now))
+                exchanged = _without_viscous(without.system.loop.add(effect))
+            found.append(Instead(exchanged, p.name, effect, then.noise, then.value - now))
     return sorted(found, key=lambda x: x.loss)
 
 

@@ -22,7 +22,7 @@ from ..parameters import Bounds, read_values, write_values
 from .bounded import least_squares
 from .data import Data
 from .finite import differences
-from .forces import force_and_slopes, torques_of
+from .forces import force_and_slopes, misreads, torques_of
 from .hypotheses import free_of
 from .linear import Place, at_samples, respond
 from .score import spanned
@@ -188,7 +188,7 @@ class Predictor(eqx.Module):
         placed = Placed.of(effect, system.loop.joints)
         push, noise, rate = force_and_slopes(placed, system.linear.motion, system.left)
         shown = self._through(self._place(effect), push)
-        if type(effect).read is not AbstractEffect.read:
+        if misreads(effect):
             shown = shown + self._through("noise", noise) + self._through("rate", rate)
         return shown
 

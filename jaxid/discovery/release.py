@@ -16,12 +16,10 @@ from ..simulation.steps import set_substeps
 from ..simulation.widening import LEAD, SIGN
 from .predict import Predictor
 from .score import spanned
-from .signs import OF_SIGN, follows
+from .signs import JUMPS, OF_SIGN, follows
 
 # A positive value is also tried multiplied and divided by this factor.
 _FACTOR = 5.0
-# Smallest smoothing, as a share of its scale, from which others are tried.
-_NOTHING = 0.02
 
 
 class Release(eqx.Module):
@@ -157,7 +155,7 @@ def _settings(p: Parameter, together: list[str], loop: ClosedLoop) -> list[dict[
     named = {q.name: float(np.asarray(q.where(loop))) for q in signs}
     # Multiplication does not change a value at the bound zero.
     scale = next(q.declaration.scale for q in signs if q.name == smoothing)
-    centre = named[smoothing] if named[smoothing] > _NOTHING * scale else scale
+    centre = named[smoothing] if named[smoothing] > JUMPS * scale else scale
     # Along an imposed motion a setting costs almost nothing.
     fine = imposed(loop)
     factors = (0.2, 0.4, 0.7, 1.0, 1.5, 2.5, 5.0) if fine else (0.2, 1.0, 5.0)

@@ -11,6 +11,9 @@ from ..noise import ARFilter, centred, fit_ar
 from .data import Data, Rows
 from .score import Blocks, Whitened, by_width, explained_by, strong_directions
 
+# Largest order of a model's noise filters.
+HIGHEST = 30
+
 
 class Separated(eqx.Module):
     """The noise filters, one per output, and the blocks that were selected with them.
@@ -77,7 +80,7 @@ def columns_of(blocks: Blocks, chosen: Sequence[int]) -> list[int]:
     return [c for k in chosen for c in blocks[k]]
 
 
-def noise_of(data: Data, rows: Rows, lost: float, highest: int = 30) -> tuple[ARFilter, ...]:
+def noise_of(data: Data, rows: Rows, lost: float, highest: int = HIGHEST) -> tuple[ARFilter, ...]:
     """One AR filter per output, with the variance corrected for the model's degrees of freedom.
 
     **Arguments:**

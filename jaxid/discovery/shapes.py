@@ -19,7 +19,7 @@ from .models import Model
 from .release import doubtful
 from .text import joined
 
-# Other start values of a shape relative to its value, and of the form of a sign.
+# Start values of a shape relative to its value, and of the form of a sign.
 _SHARES, _FORMS = (1.0, 0.5), (0.0, 1.0)
 # Largest distance in deviations between two fits in the same minimum.
 _SAME = 0.5

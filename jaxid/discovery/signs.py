@@ -17,7 +17,7 @@ _DEFAULT = 0.01, 0.0
 # Relative difference of shapes that changes a fit by less than its deviations.
 _SAME = 0.1
 # Smoothing below which a sign jumps, as a share of its scale.
-_JUMPS = 0.02
+JUMPS = 0.02
 # Form between those of arctan and tanh.
 _BETWEEN = 0.5
 # Form above which a sign is a ramp, as a share of the largest one.
@@ -89,7 +89,7 @@ def from_usual_signs(loop: ClosedLoop) -> ClosedLoop | None:
             continue
         form = free.get((*place[:2], SIGN[1]))
         ramp = form is not None and float(form.where(loop)) > _RAMP * form.declaration.upper
-        if float(p.where(loop)) < _JUMPS * p.declaration.scale or ramp:
+        if float(p.where(loop)) < JUMPS * p.declaration.scale or ramp:
             values[p.name] = p.declaration.scale
             if form is not None:
                 values[form.name] = _BETWEEN

@@ -154,7 +154,7 @@ def effect_parameters(loop: ClosedLoop, effect: AbstractEffect) -> list[tuple[in
         raise ModelError(f"{effect.effect_name()} is not one of the loop's effects: add it first")
     found, place = [], 0
     for p in loop.free_parameters:
-        steps = p.where.steps  # type: ignore[attr-defined]
+        steps = p.place
         if steps[:2] == ("effects", position):
             # Values with names of their own, such as those of a carried body, keep them.
             numbered = [f"{steps[-1]}[{k + 1}]" if p.several else steps[-1] for k in range(p.size)]

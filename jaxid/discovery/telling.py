@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from ..effects import AbstractEffect
 from ..estimate import Fit, Status
 from ..recording import Recordings
-from .changes import changes
+from .changes import changed_values
 from .coloured_noise import floor_with_coloured_noise
 from .dependence import depends_on_motion
 from .diagnosis import over_recordings
@@ -135,7 +135,7 @@ def _changed(search: Search, steps: Sequence[Step], verdict: Outcome, reason: st
     for step in (last, steps[0])[: len(steps)]:
         if _sound(step):
             assert step.diagnosis is not None
-            found.append(changes(step.diagnosis, worth, error))
+            found.append(changed_values(step.diagnosis, worth, error))
     said, share = max(found, key=lambda x: x[1])
     is_the_reason = share > _MOST if reason else verdict != "outside_catalogue"
     if is_the_reason:

@@ -161,36 +161,60 @@ def _apart_in_time(fit: Fit, diagnosis: Diagnosis, worth: float) -> str:
     To first order the residual of a shift is the derivative of torque. No curve of one coordinate
     describes it, and a noise filter models it as coloured noise.
     """
-    data, motion = diagnosis.data, diagnosis.motion
+    data, rates = diagnosis.data, _torque_rates(diagnosis)
+    if rates is None:
+        return ""
+    # In units of each joint's noise, but without the noise filters, which may have modelled the
+    # shift as noise.
+    size = np.sqrt(np.sum(data.residual**2, axis=(0, 1)) / np.maximum(data.compared.sum(axis=0), 1))
+    size = np.maximum(size, 1e-300)
+    basis = spanned((data.base / size[:, None]).reshape(-1, data.base.shape[-1]))
+
+    def not_absorbed(x: np.ndarray) -> np.ndarray:
+        flat = (x / size).reshape(-1)
+        return (flat - basis @ (basis.T @ flat)).reshape(x.shape)
+
+    left, alone = not_absorbed(data.residual), np.eye(len(size))
+    shifts = [not_absorbed(rates * data.there * own) for own in alone]
+    # A shift of one joint resembles one of another joint, because all have one delay.
+    gains = [np.sum(x * left) ** 2 / max(np.sum(x**2), 1e-300) for x in shifts]
+    j = int(np.argmax(gains))
+    own, percent = shifts[j], over_recordings(fit.error_percent.to_numpy())[j]
+    if np.linalg.norm(own) < 1e-6 * np.linalg.norm(rates * data.there * alone[j] / size):
+        return ""
+    late = float(np.sum(own * left) / np.sum(own**2))
+    filters = enumerate(diagnosis.noise)
+    chance = np.sqrt(sum(f.product_variance(x[:, o] / size[o]) for o, f in filters for x in own))
+    part = abs(late) * np.linalg.norm(own[..., j]) / np.linalg.norm(left[..., j])
+    large = part**2 > 1 - 1 / REFUTED**2 and part * percent > worth
+    if not large or abs(np.sum(own * left)) < _SURE * chance:
+        return ""
+    # Under an unknown law one delay of all joints is estimated.
+    others = "relative to the other joints, " if fit.loop.controller.imposes else ""
+    return (
+        f"the residual of {joint_columns(fit.loop.joints)[j]} suggests that {others}its torque is "
+        f"recorded {1e3 * abs(late):.3g} ms {'before' if late > 0 else 'after'} it acts: check "
+        "time stamps, filters on one of the signals and delays of the drive"
+    )
+
+
+def _torque_rates(
+    diagnosis: Diagnosis,
+) -> Float[np.ndarray, "recordings samples joints"] | None:
+    """Derivative of the torque by time at the compared rows; None if torque is not compared.
+
+    Under an unknown law it is that by the delay, which contains the low-pass of the compared
+    torque: steps of dry friction have no other derivative.
+    """
+    data, motion, place = diagnosis.data, diagnosis.motion, 0
+    for p in diagnosis.fit.loop.free_parameters:
+        if p.place == ("controller", "delay"):
+            return data.base[..., place]
+        place += p.size
     torque, time = np.asarray(motion.tau), np.asarray(motion.t)
     if torque.shape != data.residual.shape or data.residual.shape[1] < 3:
-        return ""
-    step = row_period(time, data.mask)
-    # Without the noise filters, which may have modelled the shift as noise.
-    basis = spanned(data.base.reshape(-1, data.base.shape[-1]))
-    left = data.residual.reshape(-1)
-    left = left - basis @ (basis.T @ left)
-    percent = over_recordings(fit.error_percent.to_numpy())
-    for j, label in enumerate(joint_columns(fit.loop.joints)):
-        rate = np.zeros_like(data.residual)
-        rate[..., j] = np.gradient(torque[..., j], step, axis=1) * data.there[..., j]
-        own = rate.reshape(-1)
-        own = own - basis @ (basis.T @ own)
-        late = float(own @ left) / max(float(own @ own), 1e-300)
-        rows = own.reshape(rate.shape)
-        pairs = enumerate(diagnosis.noise)
-        chance = np.sqrt(sum(f.product_variance(x[:, o]) for o, f in pairs for x in rows))
-        rest = left.reshape(rate.shape)[..., j]
-        part = abs(late) * np.linalg.norm(rows[..., j]) / np.linalg.norm(rest)
-        large = part**2 > 1 - 1 / REFUTED**2 and part * percent[j] > worth
-        if large and abs(float(own @ left)) > _SURE * chance:
-            order = "before" if late > 0 else "after"
-            return (
-                f"the residual of {label} suggests that its torque is recorded "
-                f"{1e3 * abs(late):.3g} ms {order} it acts: check time stamps, filters on one of "
-                "the signals and delays of the drive"
-            )
-    return ""
+        return None
+    return np.gradient(torque, row_period(time, data.mask), axis=1)
 
 
 def over_rich(
@@ -359,10 +383,14 @@ def _mean_square(rest: Float[np.ndarray, "rows joints"]) -> Float[np.ndarray, " 
 def _chance(filt: ARFilter, rest: Float[np.ndarray, " rows"]) -> float:
     """Relative standard deviation of the mean square of noise over that of `_power`."""
     rows = max(int(np.count_nonzero(rest)), 1)
-    spectrum = filt.spectrum(max(rows, 64))
-    spread = np.sqrt(2 / rows * np.mean(spectrum**2)) / np.mean(spectrum)
     # The median of half as many exponential variables, over its expectation.
-    return float(spread + 1 / (np.log(2) * np.sqrt(rows / 2)))
+    return _spread(filt, rows) + 1 / (np.log(2) * np.sqrt(rows / 2))
+
+
+def _spread(filt: ARFilter, rows: int) -> float:
+    """Relative standard deviation of the mean square of noise from a filter."""
+    power = filt.spectrum(max(rows, 64))
+    return float(np.sqrt(2 / rows * np.mean(power**2)) / np.mean(power))
 
 
 def _unsure(fit: Fit, held_out: Comparison) -> Float[np.ndarray, "recordings joints"]:

@@ -67,7 +67,7 @@ class AbstractEffect(eqx.Module):
     `command` changes the torque on its way through the drive, `torque` acts at the joint, `read`
     changes the sensor's reading. Effects between drive and link are `AbstractTransmission`s.
 
-    Class attributes, all False by default:
+    Class attributes, False by default:
 
     - `inertial`: `torque` depends on acceleration and is affine in it.
     - `needs_acceleration`: `torque` depends on acceleration in another way; `a` is then the
@@ -79,8 +79,8 @@ class AbstractEffect(eqx.Module):
     - `on_link`: `torque` acts on the link, beyond an elastic transmission.
     - `joint_fields`: names of the fields that are joint numbers, for an effect that depends and
       acts on no other joints; one compiled program then serves all joints (none by default).
-    - `several`: a joint may have more than one of this effect, such as a stop at each end. If any
-      other effect is found twice on a joint, it approximates a different effect.
+    - `several`: how many of this effect a joint may have, such as a stop at each end; 1 by default.
+      More of them approximate a different effect.
     - `contact`: parts separate and touch again. A fit with a wrong stiffness then converges to a
       wrong minimum, so the stiffness is estimated as well.
     - `local`: it acts only in a part of the motion, such as a stop or a limit. That part may occur
@@ -96,7 +96,7 @@ class AbstractEffect(eqx.Module):
     finite: ClassVar[bool] = False
     on_link: ClassVar[bool] = False
     joint_fields: ClassVar[tuple[str, ...]] = ()
-    several: ClassVar[bool] = False
+    several: ClassVar[int] = 1
     contact: ClassVar[bool] = False
     local: ClassVar[bool] = False
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ()

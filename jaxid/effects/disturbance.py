@@ -15,7 +15,7 @@ class PeriodicDisturbance(AbstractEffect):
     """A torque at one unknown frequency: A cos(2 pi f t) + B sin(2 pi f t)."""
 
     joint_fields = ("joint",)
-    several = True
+    several = 2
     joint: int = eqx.field(static=True)
     A: Scalar = parameter(0.0, symbol="DA", unit="N·m", scale=0.1)
     B: Scalar = parameter(0.0, symbol="DB", unit="N·m", scale=0.1)

@@ -24,7 +24,8 @@ class TorqueRipple(AbstractEffect):
     """Cogging and gear ripple: A cos(n q) + B sin(n q), n unknown."""
 
     joint_fields = ("joint",)
-    several = True
+    # Of the motor's poles, of the gear's teeth, and a multiple of one of them.
+    several = 3
     joint: int = eqx.field(static=True)
     A: Scalar = parameter(0.0, symbol="RA", unit="N·m", scale=0.1)
     B: Scalar = parameter(0.0, symbol="RB", unit="N·m", scale=0.1)
@@ -94,7 +95,7 @@ class EndStop(AbstractEffect):
     """
 
     joint_fields = ("joint",)
-    several = True
+    several = 2
     joint: int = eqx.field(static=True)
     stiffness: Scalar = parameter(0.0, symbol="ke", unit="N·m/rad", lower=0.0, scale=1.0)
     angle: Scalar = parameter(0.0, symbol="qe", unit="rad", scale=0.1, linear=False)
