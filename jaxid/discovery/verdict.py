@@ -30,6 +30,9 @@ Outcome = Literal["adequate", "explained", "outside_catalogue", "undetermined"]
 _SURE = 4.0
 # Ratio of the residual's power to that of its innovations above which it is not white noise.
 _COLOURED = 1.5
+# Largest ratio of the noise of a held-out recording to that of the fitted ones. An error that is
+# larger over all frequencies may be that of a resonance.
+_LOUDER = 2.0
 # Smallest significant increase of the error on held-out recordings, in standard deviations.
 _ROSE = 3.0
 
@@ -332,11 +335,11 @@ def _raised(
 def _above_noise(fit: Fit, held_out: Comparison, noise: Sequence[ARFilter], worth: float) -> str:
     """The reason if the held-out error is larger than noise and uncertain parameters explain."""
     # Noise may grow with the motion. Its power is that of the noisiest fitted recording, or the
-    # estimate from the held-out recording itself if that is larger.
+    # estimate from the held-out recording itself if that is larger, up to a limit.
     fitted = np.max([_mean_square(r) for r in fit.residuals], axis=0)
     left = np.stack([_mean_square(r) for r in held_out.residuals])
     own = [[_power(f, r[:, j]) for j, f in enumerate(noise)] for r in held_out.residuals]
-    power = np.maximum(fitted, np.array(own))
+    power = np.clip(np.array(own), fitted, _LOUDER**2 * fitted)
     chance = np.stack(
         [[_chance(f, r[:, j]) for j, f in enumerate(noise)] for r in held_out.residuals]
     )
