@@ -23,11 +23,11 @@ def test_a_joint_has_a_largest_number_of_each_effect():
     ripple, spring = TorqueRipple(joint=1, harmonic=2.0), Spring(joint=1)
     entry = Entry(Hypothesis(ripple, (0, 1), (-np.inf,) * 2, (np.inf,) * 2), 100.0, ripple)
     assert _allowed([entry], [ripple, spring]) == [entry]
-    assert _allowed([entry], [ripple, spring, ripple]) == [entry]
-    assert _allowed([entry], [ripple, spring, ripple, ripple]) == []
-    # Two at once, beside two that the model has.
-    assert crowded([ripple, ripple], [ripple, ripple])
-    assert not crowded([ripple, ripple], [ripple, dataclasses.replace(ripple, joint=2)])
+    assert _allowed([entry], [ripple, spring]) == [entry]
+    assert _allowed([entry], [ripple, spring, ripple]) == []
+    # Two at once, beside one that the model has.
+    assert crowded([ripple, ripple], [ripple])
+    assert not crowded([ripple, ripple], [dataclasses.replace(ripple, joint=2)])
     assert crowded([spring, spring], [])
     # What a user has declared does not exclude other effects.
     assert not crowded([spring], [ripple] * 3)

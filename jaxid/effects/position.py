@@ -24,8 +24,8 @@ class TorqueRipple(AbstractEffect):
     """Cogging and gear ripple: A cos(n q) + B sin(n q), n unknown."""
 
     joint_fields = ("joint",)
-    # Of the motor's poles, of the gear's teeth, and a multiple of one of them.
-    several = 3
+    # Three of them, of few waves over the travel, approximate any bump.
+    several = 2
     joint: int = eqx.field(static=True)
     A: Scalar = parameter(0.0, symbol="RA", unit="N·m", scale=0.1)
     B: Scalar = parameter(0.0, symbol="RB", unit="N·m", scale=0.1)
