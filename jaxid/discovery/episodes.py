@@ -128,7 +128,7 @@ def episode_of(diagnosis: Diagnosis, joint: int) -> Episode | None:
     """
     rows, there = JointRows.of(diagnosis, joint), diagnosis.data.there[..., joint]
     number, time = np.nonzero(there)[0], np.asarray(diagnosis.motion.t)[there]
-    draws, found = rows.without_base(random_draws(diagnosis, joint)), []
+    draws, found = None, []
     for k in np.unique(number).tolist():
         own = number == k
         first, last = _shortest(rows.residual[own])
@@ -136,6 +136,9 @@ def episode_of(diagnosis: Diagnosis, joint: int) -> Episode | None:
         start, end = time[own][first], time[own][last - 1]
         if length > most or end - start < _SHORTEST:
             continue
+        # Most residuals have no candidate, and need no draws.
+        if draws is None:
+            draws = rows.without_base(random_draws(diagnosis, joint))
         shortest = min(b - a for a, b in map(_shortest, draws[own].T))
         if shortest > length:
             found.append(_whole(k, time[own], rows.residual[own], first, last))
