@@ -13,6 +13,7 @@ import jaxid
 from jaxid.control import Sampled, Tracking
 from jaxid.discovery import verdict
 from jaxid.discovery.floor import Floor
+from jaxid.discovery.held_out import one_raised
 from jaxid.discovery.models import Model
 from jaxid.discovery.remarks import looks_sampled
 from jaxid.discovery.undecided import undecided
@@ -79,6 +80,21 @@ def test_an_addition_that_raises_the_held_out_error_is_refuted(found):
     first, last = found.steps[0].held_out, found.steps[-1].held_out
     said = asked(found, both=(last, first))
     assert "raised the error of joint" in said
+
+
+def test_one_addition_that_raises_the_held_out_error_is_named(found):
+    first, last = found.steps[0], found.steps[-1]
+    # The comparisons changed places: the added effect then raises the error.
+    before = dataclasses.replace(first, held_out=last.held_out)
+    noise = found.diagnosis.noise
+    seen = on_unseen(last.held_out, first.held_out, noise, WORTH)
+    step = dataclasses.replace(last, held_out=first.held_out, unseen=seen)
+    said = one_raised(before, step)
+    error = first.held_out.error_percent.to_numpy().max()
+    assert "torque_offset on joint" in said
+    assert f"to {error:.3g} %" in said
+    assert one_raised(first, dataclasses.replace(last, unseen="mixed")) == ""
+    assert one_raised(first, dataclasses.replace(last, unseen="lowers")) == ""
 
 
 def test_what_held_out_recordings_say_of_an_effect_is_told(found):

@@ -4,12 +4,15 @@ import dataclasses
 import itertools
 from collections.abc import Sequence
 
+import numpy as np
+
 from ..errors import FitError
 from ..estimate import Fit
+from ..estimate.result import joint_columns
 from .comparison import Comparison, compare
 from .models import Model
 from .search import Search
-from .step import Step
+from .step import Step, joint_errors
 from .text import joined
 from .verdict import on_unseen, risen
 
@@ -55,12 +58,31 @@ def tested(search: Search, steps: Sequence[Step]) -> list[Step]:
     return found
 
 
+def one_raised(before: Step, step: Step) -> str:
+    """A reason that names the added effect of a step that raised the held-out error."""
+    if step.unseen != "raises" or before.held_out is None or step.held_out is None:
+        return ""
+    was, now = (joint_errors(x.error_percent) for x in (before.held_out, step.held_out))
+    j = int(np.argmax(now - was))
+    return (
+        f"{step.label.removeprefix('+ ')} lowers the error on the fitted recordings and raises "
+        f"that of {joint_columns(len(now))[j]} on held-out recordings from {was[j]:.3g} to "
+        f"{now[j]:.3g} %: it may approximate another law, so record other motions"
+    )
+
+
 def raised(search: Search, steps: Sequence[Step]) -> str:
-    """A reason that names the effects that raised the held-out error; empty if none did."""
+    """A reason that names the effects that raised the held-out error; empty if none did.
+
+    One effect may raise it while all together lower it.
+    """
     seen = [s.held_out for s in steps if s.held_out is not None]
     noise, worth = search.at.noise, search.asked.worth
-    if len(seen) < 2 or not (reason := risen(seen[0], seen[-1], noise, worth)):
+    if len(seen) < 2:
         return ""
+    reason = risen(seen[0], seen[-1], noise, worth)
+    if not reason:
+        return next(filter(None, itertools.starmap(one_raised, itertools.pairwise(steps))), "")
     culprits = [s for s in steps if s.unseen in ("raises", "mixed")]
     # The names of all added effects would not add to the reason.
     some = 0 < len(culprits) < len(seen) - 1

@@ -34,7 +34,8 @@ _SINGULAR = 1e-10
 _APART = 3.0
 # Largest number of refits in which frictions take the estimated sign of their joint.
 _SIGN_TURNS = 6
-# Decrease of the score by one of them below which the shape of the sign does not matter.
+# Change of the score below which the shape of the sign does not matter, and two fits of the same
+# effects without filters are in the same minimum.
 _LITTLE = 1.0
 # Ratio of errors with and without filters above which filters model an error of the model as
 # noise.
@@ -157,11 +158,14 @@ class Refits(eqx.Module):
         gained = score_of(before).value - score_of(best).value
         if not tried and not promised / _FAR < gained < promised * _FAR:
             # A fit that strays has been repeated without filters already.
-            plain = best if _is_plain(best) else self.unfiltered(loop, noise)
-            best = self.best([best, self.filtered(plain.loop, noise)])
+            tried.append(best if _is_plain(best) else self.unfiltered(loop, noise))
+            best = self.best([best, self.filtered(tried[-1].loop, noise)])
         for order in (effects, effects[::-1]) if len(effects) > 1 else ():
             if score_of(before).value - score_of(best).value < promised / _FAR:
-                best = self.best([best, self.filtered(self.in_turn(before, order, noise), noise)])
+                plain = self.in_turn(before, order, noise)
+                if not _ends_as(plain, tried):
+                    best = self.best([best, self.filtered(plain.loop, noise)])
+                tried.append(plain)
         loose = [name for name in held if name not in best.loop.names]
         if loose:
             best = self.best([best, self.filtered(best.loop.free(*loose), noise)])
@@ -169,15 +173,15 @@ class Refits(eqx.Module):
 
     def in_turn(
         self, before: Fit, effects: Sequence[AbstractEffect], noise: Sequence[ARFilter]
-    ) -> ClosedLoop:
-        """A loop with additional effects, of which each is fitted before the next is added.
+    ) -> Fit:
+        """A fit with additional effects, of which each is fitted before the next is added.
 
         Two large effects at once may be too far from the minimum for a fit to converge.
         """
-        loop = before.loop
+        found = before
         for effect in effects:
-            loop = self.with_one(loop, effect, noise).loop
-        return loop
+            found = self.with_one(found.loop, effect, noise)
+        return found
 
     def with_one(self, loop: ClosedLoop, effect: AbstractEffect, noise: Sequence[ARFilter]) -> Fit:
         """The fit of a loop with one more effect under the assumption of white noise."""
@@ -199,6 +203,13 @@ class Refits(eqx.Module):
 def _is_plain(found: Fit) -> bool:
     """Whether a fit assumes white noise."""
     return isinstance(found.noise, tuple) and all(f.order == 0 for f in found.noise)
+
+
+def _ends_as(plain: Fit, tried: Sequence[Fit]) -> bool:
+    """Whether a fit without filters ends in the minimum of an earlier one."""
+    ends = [score_of(f).value for f in tried if f.status.simulated]
+    own = score_of(plain).value
+    return plain.status.simulated and any(abs(own - end) < _LITTLE for end in ends)
 
 
 def _promising(before: Fit, tried: Sequence[Fit]) -> list[Fit]:

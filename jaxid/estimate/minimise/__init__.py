@@ -1,6 +1,7 @@
 """The least-squares problem of a simulated loop, and its minimisation by optimistix."""
 
 from .arrow import Arrow as Arrow
+from .curvature import with_curvature as with_curvature
 from .descent import BoundedDescent as BoundedDescent
 from .descent import promised as promised
 from .filling import Filling as Filling

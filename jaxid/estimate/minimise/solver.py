@@ -10,6 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from .arrow import Arrow, Unknowns, empty_arrow
+from .curvature import with_curvature
 from .descent import BoundedDescent, DescentState, Products, promised
 from .search import Nielsen, SearchState
 
@@ -30,6 +31,8 @@ class SolverState(eqx.Module):
 
     - `y_eval`: the next point to evaluate. `first`: whether no point was evaluated yet.
     - `f_info`: products at the last accepted point; `accepted`: whether this is the newest point.
+    - `descent`: products that the next step uses, with the curvature along the last step. After a
+      refused step they are `f_info`.
     - `result`: divergence if even the shortest step does not lower the loss.
     - `losses`: losses of the last accepted points, newest last, with infinity for missing points.
     """
@@ -48,6 +51,9 @@ class SolverState(eqx.Module):
 
 class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Damped Gauss-Newton steps within bounds, for parameters and initial states together.
+
+    The Hessian of a step is J'J with the curvature that the last accepted step showed
+    (`with_curvature`); if a step is refused, the next one uses J'J.
 
     Unknowns are `(parameters, initial states by recording)`; the latter have the shape `(0, 0)` if
     there are none. Supports the following `options`:
@@ -102,15 +108,17 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         else:
             found, rows, aux = _linearised(fn, state.y_eval, args)
         size, accepted, _, search = self.search.step(
-            state.first, y, state.y_eval, state.f_info, found, state.search
+            state.first, y, state.y_eval, state.descent.f_info, found, state.search
         )
 
         def chosen(new, old):
             return jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, old)
 
+        curved = with_curvature(found, state.f_info, state.y_eval[0] - y[0])
         y = chosen(state.y_eval, y)
-        descent = chosen(self.descent.query(y, found, state.descent), state.descent)
         f_info = chosen(found, state.f_info)
+        scales = self.descent.query(y, f_info, state.descent).scales
+        descent = DescentState(y, chosen(curved, f_info), scales)
         losses = jnp.where(accepted, jnp.append(state.losses[1:], 2 * f_info.f), state.losses)
         # One compiled piece of code for both steps; it is most of the program.
         sizes = jnp.stack([size, jnp.full_like(size, FULL)])
@@ -118,7 +126,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         diff, full = (jax.tree.map(lambda x, k=k: x[k], diffs) for k in (0, 1))
         # The predicted decrease of a full step is half its squared length in deviations times the
         # residual's variance.
-        decrease, variance = 2 * promised(full, f_info), losses[-1] / rows
+        decrease, variance = 2 * promised(full, descent.f_info), losses[-1] / rows
         settled = decrease <= self.tolerance**2 * variance
         flat = losses[0] - losses[-1] < self.worth * losses[-1]
         # Dummy unknowns and values at a bound do not move.
