@@ -2,16 +2,18 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from loops import sines
 
 import jaxid
-from jaxid.arms import Axis
+from jaxid.arms import AbstractArm, Axis
 from jaxid.control import Tracking
 from jaxid.discovery.coloured_noise import floor_with_coloured_noise
 from jaxid.discovery.episodes import episode_of, in_episodes, in_one_episode
 from jaxid.effects import Coulomb, Stribeck, TorqueOffset, Viscous
+from jaxid.parameters import Scalar, parameter
 
 
 @pytest.mark.xdist_group("offset")
@@ -84,6 +86,48 @@ def test_a_push_in_one_recording_is_found_and_is_no_noise():
     assert in_one_episode(diagnosis, 100.0) == ""
     floor = floor_with_coloured_noise(diagnosis.fit, diagnosis, diagnosis.noise, None, 0.05)
     assert floor is diagnosis.measured
+
+
+class Gantry(AbstractArm):
+    """Two sliding joints that do not act on each other."""
+
+    M1: Scalar = parameter(4.0, symbol="M1", unit="kg", lower=0.0)
+    M2: Scalar = parameter(4.0, symbol="M2", unit="kg", lower=0.0)
+
+    @property
+    def joints(self) -> int:
+        return 2
+
+    def prismatic(self) -> tuple[bool, ...]:
+        return (True, True)
+
+    def workspace(self) -> np.ndarray:
+        return np.zeros((1, 2))
+
+    def mass_matrix(self, q):
+        return jnp.diag(jnp.stack([self.M1, self.M2]))
+
+    def bias(self, q, v):
+        return jnp.zeros_like(q)
+
+
+@pytest.mark.parametrize(("wave", "named"), [(0.1, True), (20.0, False)])
+def test_an_episode_beside_a_larger_error_of_another_joint_is_no_reason(wave, named):
+    """The second joint lacks a force at all times, which no parameter explains."""
+    runs = []
+    for first, second in ((pushed(1, push=6.0), pushed(3)), (pushed(2), pushed(4))):
+        q, tau = (
+            np.column_stack([getattr(x, name)[:, 0] for x in (first, second)])
+            for name in ("q", "tau")
+        )
+        tau[:, 1] += wave * np.sin(2 * np.pi * 0.9 * first.time)
+        runs.append(jaxid.Recording.from_arrays(first.time, q, tau, name=first.name))
+    effects = [x for j in (1, 2) for x in (Viscous(j, 1.0), Coulomb(j, 1.0, smoothing=0.02))]
+    loop = jaxid.ClosedLoop(Gantry(), Tracking(cutoff=10.0), tuple(effects), name="gantry")
+    diagnosis = jaxid.diagnose(jaxid.fit(loop, runs, jaxid.OEM(progress=False)), catalogue=[])
+    assert episode_of(diagnosis, 0) is not None
+    assert episode_of(diagnosis, 1) is None
+    assert in_one_episode(diagnosis, 0.05).startswith("on run_1 the error of joint 1") == named
 
 
 @pytest.mark.parametrize("noise", ["white", "bursts"])

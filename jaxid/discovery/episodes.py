@@ -82,7 +82,8 @@ def in_one_episode(diagnosis: Diagnosis, worth: float) -> str:
     """The reason if the residual of joints is large in one episode only; empty if it is not.
 
     A push or a contact in one recording cannot be predicted from others, like noise, and the
-    estimated values are wrong at all times.
+    estimated values are wrong at all times. If a joint without an episode has the largest error
+    above its noise floor, something else is the reason.
 
     **Arguments:**
 
@@ -97,7 +98,7 @@ def in_one_episode(diagnosis: Diagnosis, worth: float) -> str:
         one = episode_of(diagnosis, j)
         if one is not None and error[one.recording, j] * np.sqrt(1 - one.outside**2) > least:
             found.append((error[one.recording, j], j, one))
-    if not found:
+    if _worst_joint(diagnosis) not in [j for _, j, _ in found]:
         return ""
     percent, j, worst = max(found, key=lambda x: x[0])
     same = [
@@ -115,6 +116,12 @@ def in_one_episode(diagnosis: Diagnosis, worth: float) -> str:
         f"{also}: a push, a contact or a stop may act there, or torque was not recorded "
         "correctly; leave this time out (Recording.slice), or record again"
     )
+
+
+def _worst_joint(diagnosis: Diagnosis) -> int:
+    """The joint with the largest error above its measured noise floor, from 0."""
+    floor = 0.0 if diagnosis.measured is None else np.nan_to_num(diagnosis.measured.percent)
+    return int(np.argmax(np.max(diagnosis.fit.error_percent.to_numpy() - floor, axis=0)))
 
 
 def episode_of(diagnosis: Diagnosis, joint: int) -> Episode | None:

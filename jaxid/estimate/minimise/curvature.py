@@ -10,6 +10,11 @@ from .descent import Products
 
 # Share of the curvature by J'J below which a step is assumed to have this share (Powell 1978).
 _LEAST_SHARE = 0.2
+# Share above which steps with J'J converge fast enough.
+_LARGE_SHARE = 0.75
+# Relative decrease of the squared error above which a step is far from the minimum, where J'J is
+# the better Hessian; Fletcher and Xu (1987) choose in the same way.
+_FAR = 0.1
 
 
 def with_curvature(found: Products, before: Products, step: Float[Any, " parameters"]) -> Products:
@@ -19,8 +24,9 @@ def with_curvature(found: Products, before: Products, step: Float[Any, " paramet
     curvature, and steps with J'J alone converge linearly. (Of an arm with a backlash that the model
     lacks, each step of the delay covered a fifth of the distance to the minimum.) The update is
     that of BFGS with J'J as the previous Hessian (Al-Baali and Fletcher 1985), damped so that the
-    result is positive definite (Powell 1978). With estimated initial states the products are
-    returned unchanged, because the updated matrix is no `Arrow`.
+    result is positive definite (Powell 1978). The products are returned unchanged if the squared
+    error still decreases fast, if J'J does not overestimate the curvature along the step much, and
+    with estimated initial states, because the updated matrix is then no `Arrow`.
 
     **Arguments:**
 
@@ -33,14 +39,15 @@ def with_curvature(found: Products, before: Products, step: Float[Any, " paramet
         return found
     along = hessian.dense @ step
     expected = step @ along
-    moved = expected > 0
-    unit = jnp.where(moved, expected, 1.0)
+    unit = jnp.where(expected > 0, expected, 1.0)
     change = found.grad[0] - before.grad[0]
     share = step @ change / unit
+    near = before.f - found.f < _FAR * before.f
+    used = (expected > 0) & near & (share < _LARGE_SHARE)
     weight = jnp.where(share < _LEAST_SHARE, (1 - _LEAST_SHARE) / (1 - share), 1.0)
     change = weight * change + (1 - weight) * along
-    # The damped change has at least this share, so the division is safe.
-    size = jnp.where(moved, step @ change, 1.0)
+    # The damped change has at least the least share, so the division is safe.
+    size = jnp.where(used, step @ change, 1.0)
     added = jnp.outer(change, change) / size - jnp.outer(along, along) / unit
-    dense = hessian.dense + jnp.where(moved, added, 0.0)
+    dense = hessian.dense + jnp.where(used, added, 0.0)
     return Products(found.f, found.grad, Arrow(dense, hessian.blocks, hessian.border))

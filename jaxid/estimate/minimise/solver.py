@@ -52,8 +52,8 @@ class SolverState(eqx.Module):
 class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Damped Gauss-Newton steps within bounds, for parameters and initial states together.
 
-    The Hessian of a step is J'J with the curvature that the last accepted step showed
-    (`with_curvature`); if a step is refused, the next one uses J'J.
+    The Hessian of a step is J'J. If this overestimates the curvature that the last step showed, it
+    is corrected along that step (`with_curvature`); if a step is refused, the next one uses J'J.
 
     Unknowns are `(parameters, initial states by recording)`; the latter have the shape `(0, 0)` if
     there are none. Supports the following `options`:
