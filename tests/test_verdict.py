@@ -89,12 +89,13 @@ def test_one_addition_that_raises_the_held_out_error_is_named(found):
     noise = found.diagnosis.noise
     seen = on_unseen(last.held_out, first.held_out, noise, WORTH)
     step = dataclasses.replace(last, held_out=first.held_out, unseen=seen)
-    said = one_raised(before, step)
+    said = one_raised([before, step], noise, WORTH)
     error = first.held_out.error_percent.to_numpy().max()
-    assert "torque_offset on joint" in said
+    assert said.startswith(f"torque_offset on joint {last.added.joint} raised the error of joint ")
     assert f"to {error:.3g} %" in said
-    assert one_raised(first, dataclasses.replace(last, unseen="mixed")) == ""
-    assert one_raised(first, dataclasses.replace(last, unseen="lowers")) == ""
+    for unseen in ("mixed", "lowers"):
+        spared = dataclasses.replace(step, unseen=unseen)
+        assert one_raised([before, spared], noise, WORTH) == ""
 
 
 def test_what_held_out_recordings_say_of_an_effect_is_told(found):

@@ -4,15 +4,13 @@ import dataclasses
 import itertools
 from collections.abc import Sequence
 
-import numpy as np
-
 from ..errors import FitError
 from ..estimate import Fit
-from ..estimate.result import joint_columns
+from ..noise import ARFilter
 from .comparison import Comparison, compare
 from .models import Model
 from .search import Search
-from .step import Step, joint_errors
+from .step import Step
 from .text import joined
 from .verdict import on_unseen, risen
 
@@ -58,17 +56,19 @@ def tested(search: Search, steps: Sequence[Step]) -> list[Step]:
     return found
 
 
-def one_raised(before: Step, step: Step) -> str:
-    """A reason that names the added effect of a step that raised the held-out error."""
-    if step.unseen != "raises" or before.held_out is None or step.held_out is None:
-        return ""
-    was, now = (joint_errors(x.error_percent) for x in (before.held_out, step.held_out))
-    j = int(np.argmax(now - was))
-    return (
-        f"{step.label.removeprefix('+ ')} lowers the error on the fitted recordings and raises "
-        f"that of {joint_columns(len(now))[j]} on held-out recordings from {was[j]:.3g} to "
-        f"{now[j]:.3g} %: it may approximate another law, so record other motions"
-    )
+def one_raised(steps: Sequence[Step], noise: Sequence[ARFilter], worth: float) -> str:
+    """A reason that names the first effect that raised the held-out error; empty if none did.
+
+    **Arguments:**
+
+    - `noise`: noise filters of the residual of the final model, one per output.
+    - `worth`: smallest relevant change, in % of a joint's torque.
+    """
+    for before, step in itertools.pairwise(steps):
+        if step.unseen == "raises" and before.held_out is not None and step.held_out is not None:
+            name = step.label.removeprefix("+ ")
+            return risen(before.held_out, step.held_out, noise, worth, name)
+    return ""
 
 
 def raised(search: Search, steps: Sequence[Step]) -> str:
@@ -82,7 +82,7 @@ def raised(search: Search, steps: Sequence[Step]) -> str:
         return ""
     reason = risen(seen[0], seen[-1], noise, worth)
     if not reason:
-        return next(filter(None, itertools.starmap(one_raised, itertools.pairwise(steps))), "")
+        return one_raised(steps, noise, worth)
     culprits = [s for s in steps if s.unseen in ("raises", "mixed")]
     # The names of all added effects would not add to the reason.
     some = 0 < len(culprits) < len(seen) - 1

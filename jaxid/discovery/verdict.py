@@ -281,7 +281,13 @@ def _above_measured(fit: Fit | Comparison, floor: Floor | None, worth: float) ->
     )
 
 
-def risen(before: Comparison, after: Comparison, noise: Sequence[ARFilter], worth: float) -> str:
+def risen(
+    before: Comparison,
+    after: Comparison,
+    noise: Sequence[ARFilter],
+    worth: float,
+    added: str = "the added effects",
+) -> str:
     """The reason if added effects raised the error on held-out recordings; empty if not.
 
     **Arguments:**
@@ -289,15 +295,16 @@ def risen(before: Comparison, after: Comparison, noise: Sequence[ARFilter], wort
     - `before`, `after`: comparisons of the models without and with the added effects.
     - `noise`: noise filters of the residual of the later model, one per output.
     - `worth`: smallest relevant change, in % of a joint's torque.
+    - `added`: the effects in words.
     """
     joints = _raised(before, after, noise, worth)
     if not joints:
         return ""
-    label = joint_columns(after.loop.joints)[joints[0]]
-    was, now = (over_recordings(c.error_percent.to_numpy())[joints[0]] for c in (before, after))
+    was, now = (over_recordings(c.error_percent.to_numpy()) for c in (before, after))
+    j = max(joints, key=lambda k: now[k] - was[k])
     return (
-        f"the added effects raised the error of {label} on held-out recordings from "
-        f"{was:.3g} to {now:.3g} %: also fit recordings with motions like the held-out ones"
+        f"{added} raised the error of {joint_columns(len(now))[j]} on held-out recordings from "
+        f"{was[j]:.3g} to {now[j]:.3g} %: also fit recordings with motions like the held-out ones"
     )
 
 

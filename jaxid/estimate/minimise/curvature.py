@@ -1,4 +1,4 @@
-"""Curvature of the squared error that J'J lacks."""
+"""The Hessian of the squared error where J'J overestimates its curvature."""
 
 from typing import Any
 
